@@ -91,7 +91,7 @@ def test_depth_and_geoms_are_those_of_rays_of_c_mujoco(camera, device):
     m, device = shapes(), wp.get_device(device)
     eye = Eye(m, device, camera, WIDTH, HEIGHT, 2, ("rgb", "depth", "geoms"), far=1e3)
     eye.depth.fill_(torch.nan)
-    assert 2 * bytes_placed(m) == sum(each.capacity for each in (eye.placed.poses, eye.placed.bounds))
+    assert 2 * bytes_placed(m) == sum(each.capacity for each in (eye.placed.sight.poses, eye.placed.sight.bounds))
     data, rng = mujoco.MjData(m), np.random.default_rng(1)
     poses = []
     for _ in range(2):
@@ -512,7 +512,7 @@ def test_a_camera_above_what_it_looks_at_has_the_axes_of_c_mujoco():
     mujoco.mj_forward(m, data)
     eye.look(wp.array([data.xpos], dtype=wp.vec3, device=device), wp.array([data.xmat], dtype=wp.mat33, device=device))
     expected = data.cam("above").xmat.reshape(3, 3)
-    np.testing.assert_allclose(eye.placed.camera.numpy()[0], expected, atol=1e-6)
+    np.testing.assert_allclose(eye.placed.sight.camera_mat.numpy()[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -523,7 +523,7 @@ def test_cameras_follow_the_center_of_mass_that_a_world_has(device):
     ]
     env = loco.make("walker_walk", 2, device, 0, randomize=vary, from_pixels=True, size=(4, 4))
     env.reset()
-    seen = env.world.seen.eye.placed._pos.numpy()
+    seen = env.world.seen.eye.placed.sight.camera_pos.numpy()
     for world, pos in enumerate(seen):
         m = env.mujoco_model(world)
         data = mujoco.MjData(m)

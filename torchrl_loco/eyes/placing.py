@@ -6,13 +6,26 @@ import mujoco
 import warp as wp
 
 from torchrl_loco.eyes.scene import AT_BODY, AT_COM, OF_COM, TRACKS, Mounts, Shapes, geoms_seen, shapes_of
-from torchrl_loco.sim import EXCLUSIVE
+from torchrl_loco.sim import EXCLUSIVE, fill
 from torchrl_loco.sim.compiled.collision.kinds import CAPSULE, CYLINDER, PLANE
 
 WHOLE = wp.constant(wp.float32(1.0e6))  # bound of a picture on the plane in front of the camera
 NEAR = wp.constant(wp.float32(1.0e-4))  # depth from which a sphere is wholly in front of the camera (m)
 Pose: Any = wp.types.matrix(shape=(3, 4), dtype=float)
 """Axes of the camera in the frame of a shape, then its place there, as columns."""
+
+
+@wp.struct
+class Sight:
+    """Shapes as they lie before the camera of each world, where it is, and the lights in its frame."""
+
+    shapes: Shapes
+    poses: wp.array2d[Pose]
+    bounds: wp.array2d[wp.vec4]  # from where to where each can be in the picture
+    camera_pos: wp.array[wp.vec3]
+    camera_mat: wp.array[wp.mat33]
+    light_pos: wp.array2d[wp.vec3]
+    light_axis: wp.array2d[wp.vec3]  # against what each shines
 
 
 @wp.func_native("""
@@ -70,17 +83,12 @@ def center(
 
 @wp.kernel(enable_backward=False)
 def mount(
-    # In:
     mounts: Mounts,
     numbers: wp.array2d[float],
     mask: wp.array[bool],
     xpos: wp.array2d[wp.vec3],
     xmat: wp.array2d[wp.mat33],
-    # Out:
-    camera_pos_out: wp.array[wp.vec3],
-    camera_mat_out: wp.array[wp.mat33],
-    light_pos_out: wp.array2d[wp.vec3],
-    light_axis_out: wp.array2d[wp.vec3],
+    sight: Sight,
 ):
     """Writes where the camera is, and in its frame where lights are, and against what each shines."""
     world = wp.tid()
@@ -105,12 +113,12 @@ def mount(
                 x = wp.where(wp.length(x) > 0.0, wp.normalize(x), wp.vec3(1.0, 0.0, 0.0))  # as MuJoCo's does
                 mat = wp.matrix_from_cols(x, wp.cross(z, x), z)
         if k == 0:
-            camera_pos_out[world] = pos
-            camera_mat_out[world] = mat
+            sight.camera_pos[world] = pos
+            sight.camera_mat[world] = mat
         else:
-            into = wp.transpose(camera_mat_out[world])
-            light_pos_out[world, k - 1] = into @ (pos - camera_pos_out[world])
-            light_axis_out[world, k - 1] = into @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
+            into = wp.transpose(sight.camera_mat[world])
+            sight.light_pos[world, k - 1] = into @ (pos - sight.camera_pos[world])
+            sight.light_axis[world, k - 1] = into @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
 
 
 @wp.func
@@ -131,34 +139,25 @@ def bounds(c: wp.vec3, radius: float) -> wp.vec4:
 
 
 @wp.kernel(enable_backward=False)
-def place(
-    # In:
-    shapes: Shapes,
-    mask: wp.array[bool],
-    xpos: wp.array2d[wp.vec3],
-    xmat: wp.array2d[wp.mat33],
-    camera_pos: wp.array[wp.vec3],
-    camera_mat: wp.array[wp.mat33],
-    # Out:
-    poses_out: wp.array2d[Pose],
-    bounds_out: wp.array2d[wp.vec4],
-):
+def place(mask: wp.array[bool], xpos: wp.array2d[wp.vec3], xmat: wp.array2d[wp.mat33], sight: Sight):
+    """Writes how the camera lies before the shapes, and where these can be in its picture."""
     world, k = wp.tid()
     if mask and not mask[world]:
         return
+    shapes = sight.shapes
     body, kind, size = shapes.body[k], shapes.kind[k], shapes.size[k]
     pos = xpos[world, body] + xmat[world, body] @ shapes.pos[k]
     mat = xmat[world, body] @ shapes.mat[k]
-    camera = camera_mat[world]
-    origin = wp.transpose(mat) @ (camera_pos[world] - pos)
+    camera = sight.camera_mat[world]
+    origin = wp.transpose(mat) @ (sight.camera_pos[world] - pos)
     turn = wp.transpose(mat) @ camera
     pose = Pose()
     for i in range(3):
         for j in range(3):
             pose[i, j] = turn[i, j]
         pose[i, 3] = origin[i]
-    poses_out[world, k] = pose
-    at = wp.transpose(camera) @ (pos - camera_pos[world])
+    sight.poses[world, k] = pose
+    at = wp.transpose(camera) @ (pos - sight.camera_pos[world])
     found = wp.vec4(-WHOLE, -WHOLE, WHOLE, WHOLE)
     if kind == CAPSULE or kind == CYLINDER:  # noqa: SIM109 (Warp has no "in")
         axis = size[1] * (wp.transpose(camera) @ wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2]))
@@ -171,7 +170,7 @@ def place(
         )
     elif kind != PLANE and shapes.geom[k] >= 0:
         found = bounds(at, shapes.radius[k])
-    bounds_out[world, k] = found
+    sight.bounds[world, k] = found
 
 
 def bytes_placed(m: mujoco.MjModel) -> int:
@@ -191,24 +190,27 @@ class Placed:
     ) -> None:
         self._mounts, self._device = mounts, device
         with EXCLUSIVE, wp.ScopedDevice(device):
-            self.shapes, self._meshes = shapes_of(m, device)
+            shapes, self._meshes = shapes_of(m, device)
             self.has_meshes = bool(self._meshes)
             self._numbers = wp.empty((worlds, 0), dtype=float) if numbers is None else numbers
-            size = worlds, self.shapes.kind.shape[0]
-            self._pos, self.camera = wp.empty(worlds, dtype=wp.vec3), wp.empty(worlds, dtype=wp.mat33)
-            # Where they are, and against what they shine, in the camera's frame.
-            self.lights = [wp.empty((worlds, mounts.mode.shape[0] - 1), dtype=wp.vec3) for _ in range(2)]
-            self.poses = wp.empty(size, dtype=Pose)
-            self.bounds = wp.empty(size, dtype=wp.vec4)  # from where to where each can be in the picture
+            size, lights = (worlds, shapes.kind.shape[0]), (worlds, mounts.mode.shape[0] - 1)
+            self.sight = fill(
+                Sight,
+                shapes=shapes,
+                poses=wp.empty(size, dtype=Pose),
+                bounds=wp.empty(size, dtype=wp.vec4),
+                camera_pos=wp.empty(worlds, dtype=wp.vec3),
+                camera_mat=wp.empty(worlds, dtype=wp.mat33),
+                light_pos=wp.empty(lights, dtype=wp.vec3),
+                light_axis=wp.empty(lights, dtype=wp.vec3),
+            )
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None) -> None:
         """Launches what places them in the worlds of a mask, ``None`` for all, on Warp's current stream.
 
         ``xpos`` and ``xmat`` are positions (m) and orientations of the bodies, ``(worlds or more, nbody)``.
         """
-        here, camera = [mask, xpos, xmat], [self._pos, self.camera]
-        for kernel, dim, inputs, outputs in (
-            (mount, self.camera.shape, [self._mounts, self._numbers, *here], [*camera, *self.lights]),
-            (place, self.bounds.shape, [self.shapes, *here, *camera], [self.poses, self.bounds]),
-        ):
-            wp.launch(kernel, dim, inputs, outputs, device=self._device)
+        sight, device = self.sight, self._device
+        inputs = [mask, xpos, xmat, sight]
+        wp.launch(mount, sight.camera_mat.shape, [self._mounts, self._numbers, *inputs], device=device)
+        wp.launch(place, sight.bounds.shape, inputs, device=device)

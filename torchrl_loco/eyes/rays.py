@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
-from torchrl_loco.eyes.scene import Shapes, for_rays, mounts_at
+from torchrl_loco.eyes.placing import Placed, Sight, origin_of, pose_of, turn_of
+from torchrl_loco.eyes.scene import for_rays, mounts_at
 from torchrl_loco.eyes.shapes import to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer
 from torchrl_loco.sim.compiled.collision.kinds import MESH
@@ -14,21 +14,18 @@ from torchrl_loco.sim.corners import axes_of
 
 @wp.kernel(enable_backward=False)
 def cast(
-    # In:
-    shapes: Shapes,
+    sight: Sight,
     mask: wp.array[bool],
     directions: wp.array[wp.vec3],
     far: float,
-    poses: wp.array2d[Pose],
-    # Out:
     distance_out: wp.array2d[float],
 ):
     world, ray = wp.tid()
     if mask and not mask[world]:
         return
-    nearest = float(far)
+    shapes, nearest = sight.shapes, float(far)
     for k in range(shapes.kind.shape[0]):
-        pose, kind = pose_of(poses, world, k), shapes.kind[k]
+        pose, kind = pose_of(sight.poses, world, k), shapes.kind[k]
         o, d = origin_of(pose), turn_of(pose) @ directions[ray]
         t = to_shape(kind, o, d, shapes.size[k])
         if kind == MESH:
@@ -59,7 +56,6 @@ class Rays:
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
         """Launches the kernels, on Warp's current stream; arguments as of :meth:`Placed.launch`."""
-        placed, out = self._placed, self._out.warp
-        placed.launch(xpos, xmat, mask)
-        inputs = [placed.shapes, mask, self._directions, self._far, placed.poses]
+        self._placed.launch(xpos, xmat, mask)
+        inputs, out = [self._placed.sight, mask, self._directions, self._far], self._out.warp
         wp.launch(cast, out.shape, inputs, [out], device=self._device)

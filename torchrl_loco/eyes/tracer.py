@@ -9,8 +9,8 @@ import mujoco
 import torch
 import warp as wp
 
-from torchrl_loco.eyes.placing import Placed, Pose, origin_of, pose_of, turn_of
-from torchrl_loco.eyes.scene import OWN, SPOT, Looks, Shapes, looks_of, mounts_of, to_the_horizon
+from torchrl_loco.eyes.placing import Placed, Sight, origin_of, pose_of, turn_of
+from torchrl_loco.eyes.scene import OWN, SPOT, Looks, looks_of, mounts_of, to_the_horizon
 from torchrl_loco.eyes.shapes import MISS, normal_of, to_mesh, to_shape
 from torchrl_loco.sim import EXCLUSIVE, Buffer, current_stream
 from torchrl_loco.sim.compiled.collision.kinds import MESH, PLANE
@@ -135,20 +135,18 @@ def tracer(
     share = 1.0 / samples
 
     @wp.func
-    def met(
-        shapes: Shapes, poses: wp.array2d[Pose], bounds: wp.array2d[wp.vec4], world: int, tile: wp.vec4, d: wp.vec3
-    ):
+    def met(sight: Sight, world: int, tile: wp.vec4, d: wp.vec3):
         """Returns how far the nearest shape in a direction is, and which; of a mesh, its normal there and the triangle.
 
         ``tile`` is the part of the picture that the threads draw at once: least x and y, greatest x and y.
         """
-        nearest, found, n, owner = float(MISS), int(-1), wp.vec3(), int(-1)
-        for first in range(0, bounds.shape[1], 32):
-            bits = candidates(bounds, world, first, tile[0], tile[1], tile[2], tile[3])
+        shapes, nearest, found, n, owner = sight.shapes, float(MISS), int(-1), wp.vec3(), int(-1)
+        for first in range(0, sight.bounds.shape[1], 32):
+            bits = candidates(sight.bounds, world, first, tile[0], tile[1], tile[2], tile[3])
             while bits != wp.uint32(0):
                 k = first + lowest(bits)
                 bits = bits & (bits - wp.uint32(1))
-                pose, kind = pose_of(poses, world, k), shapes.kind[k]
+                pose, kind = pose_of(sight.poses, world, k), shapes.kind[k]
                 o, own = origin_of(pose), turn_of(pose) @ d
                 t = to_shape(kind, o, own, shapes.size[k])
                 if wp.static(meshes):
@@ -162,10 +160,11 @@ def tracer(
         return nearest, found, n, owner
 
     @wp.func
-    def lit(shapes: Shapes, poses: wp.array2d[Pose], world: int, p: wp.vec3, to: wp.vec3, most: float) -> bool:
+    def lit(sight: Sight, world: int, p: wp.vec3, to: wp.vec3, most: float) -> bool:
         """Returns whether nothing lies between a point and a light."""
+        shapes = sight.shapes
         for k in range(shapes.kind.shape[0]):
-            kind, pose = shapes.kind[k], pose_of(poses, world, k)
+            kind, pose = shapes.kind[k], pose_of(sight.poses, world, k)
             o, d = origin_of(pose) + turn_of(pose) @ p, turn_of(pose) @ to
             if kind != PLANE:
                 # The nearest that it comes to the shape's middle is within the sphere around it.
@@ -182,17 +181,7 @@ def tracer(
 
     @wp.func
     def shaded(
-        shapes: Shapes,
-        looks: Looks,
-        light_pos: wp.array[wp.vec3],
-        light_axis: wp.array[wp.vec3],
-        poses: wp.array2d[Pose],
-        world: int,
-        p: wp.vec3,
-        n: wp.vec3,
-        eye: wp.vec3,
-        base: wp.vec3,
-        shine: wp.vec3,
+        sight: Sight, looks: Looks, world: int, p: wp.vec3, n: wp.vec3, eye: wp.vec3, base: wp.vec3, shine: wp.vec3
     ) -> wp.vec3:
         """Returns the color of a point that faces along ``n``, seen from ``eye``."""
         light, gloss = looks.ambient + wp.vec3(shine[0], shine[0], shine[0]), wp.vec3()
@@ -200,9 +189,9 @@ def tracer(
             one = looks.light[k]
             to, strength, most = eye, float(1.0), float(0.0)
             if one.kind != OWN:
-                to, most = 1.0 * light_axis[k - 1], MISS
+                to, most = 1.0 * sight.light_axis[world, k - 1], MISS
                 if one.kind == SPOT:
-                    way = light_pos[k - 1] - p
+                    way = sight.light_pos[world, k - 1] - p
                     most = wp.length(way)
                     strength = of_spot(one.attenuation, one.cone, most, wp.dot(way, to) / most)
                     light += strength * one.ambient
@@ -210,7 +199,7 @@ def tracer(
             toward = wp.dot(n, to)
             if toward > 0.0 and strength > 0.0:
                 if wp.static(shadows):
-                    if one.shadow and not lit(shapes, poses, world, p + 1.0e-3 * n, to, most):
+                    if one.shadow and not lit(sight, world, p + 1.0e-3 * n, to, most):
                         strength = 0.0
                 light += strength * toward * one.diffuse
                 mirrored = shine[1] * one.specular
@@ -222,17 +211,10 @@ def tracer(
     # Divisions and roots that round as IEEE has it took a third of the time.
     @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
     def trace(
-        # In:
         view: View,
-        shapes: Shapes,
+        sight: Sight,
         looks: Looks,
         mask: wp.array[bool],
-        camera_mat: wp.array[wp.mat33],
-        light_pos: wp.array2d[wp.vec3],
-        light_axis: wp.array2d[wp.vec3],
-        poses: wp.array2d[Pose],
-        bounds: wp.array2d[wp.vec4],
-        # Out:
         rgb_out: wp.array3d[Color],
         depth_out: wp.array3d[float],
         geoms_out: wp.array3d[int],
@@ -240,7 +222,7 @@ def tracer(
         world, thread = wp.tid()
         if mask and not mask[world]:
             return
-        tile, lane = thread // (across * down), thread % (across * down)
+        shapes, tile, lane = sight.shapes, thread // (across * down), thread % (across * down)
         per_row = (view.width + across - 1) // across
         left, top = (tile % per_row) * across, (tile // per_row) * (down * times)
         column, x0 = left + lane % across, view.pixel * float(left) - view.half[0]
@@ -252,7 +234,7 @@ def tracer(
                 x = view.pixel * (float(column) + (float(sample % samples) + 0.5) * share) - view.half[0]
                 y = view.half[1] - view.pixel * (float(row) + (float(sample // samples) + 0.5) * share)
                 d = wp.vec3(x, y, -1.0)
-                nearest, found, n, owner = met(shapes, poses, bounds, world, corners, d)
+                nearest, found, n, owner = met(sight, world, corners, d)
                 geom = int(-1)
                 if found >= 0:
                     geom = shapes.geom[found]
@@ -260,9 +242,9 @@ def tracer(
                         geom = shapes.owner[owner]
                 if wp.static(rgb):
                     if found < 0:
-                        color += sky(looks, camera_mat[world] @ d)
+                        color += sky(looks, sight.camera_mat[world] @ d)
                     else:
-                        p, pose = nearest * d, pose_of(poses, world, found)
+                        p, pose = nearest * d, pose_of(sight.poses, world, found)
                         inside = origin_of(pose) + turn_of(pose) @ p
                         if shapes.kind[found] != MESH:
                             n = normal_of(shapes.kind[found], inside, shapes.size[found])
@@ -273,19 +255,7 @@ def tracer(
                         slant = wp.max(wp.abs(wp.dot(n, eye)), 0.02)
                         spread = share * view.pixel * nearest * length / slant
                         base = painted(looks, geom, inside, spread)
-                        color += shaded(
-                            shapes,
-                            looks,
-                            light_pos[world],
-                            light_axis[world],
-                            poses,
-                            world,
-                            p,
-                            n,
-                            eye,
-                            base,
-                            looks.geom[geom].shine,
-                        )
+                        color += shaded(sight, looks, world, p, n, eye, base, looks.geom[geom].shine)
             if row < view.height and column < view.width:
                 if wp.static(depth):
                     depth_out[world, row, column] = wp.min(nearest, view.far)
@@ -372,9 +342,7 @@ class Eye:
 
         ``out`` are arrays of all ``KINDS``, ``(worlds, height, width)``, ``None`` for those that are not told.
         """
-        placed = self.placed
-        where = [mask, placed.camera, *placed.lights, placed.poses, placed.bounds]
-        inputs = [self._view, placed.shapes, self._looks, *where]
+        inputs = [self._view, self.placed.sight, self._looks, mask]
         wp.launch(self._trace, self._threads, inputs, out, device=self._device, stream=stream)
 
     def look(self, xpos: wp.array, xmat: wp.array) -> None:
