@@ -10,8 +10,8 @@ import warp as wp
 
 from torchrl_loco.sim import fill_from_numbers
 from torchrl_loco.sim.compiled.collision.kinds import BOX, CAPSULE, CYLINDER, ELLIPSOID, FIELD, MESH, PLANE, SPHERE
-from torchrl_loco.sim.corners import axes_of
-from torchrl_loco.sim.varied import Varied
+from torchrl_loco.sim.corners import DIAGONALS, axes_of
+from torchrl_loco.sim.varied import Varied, subtree_masses
 
 KINDS = (PLANE, FIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH)  # types of geoms that are seen
 GROUPS = 3  # groups of geoms that pictures show, from 0 on, as in MuJoCo's viewer
@@ -22,9 +22,8 @@ OF_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
 AT_BODY = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY))
 AT_COM = wp.constant(int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM))  # modes of cameras and lights
 SPOT, DIRECTIONAL, OWN = wp.constant(0), wp.constant(1), wp.constant(2)  # kinds of lights: the last is the camera's
-EDGES = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-"""Corners of a box, and of its sides, seen from outside."""
+"""Corners of a box, in the order of DIAGONALS, of each of its sides, seen from outside."""
 
 
 @wp.struct
@@ -138,9 +137,7 @@ def mounts_of(m: mujoco.MjModel, camera: int, device: wp.Device, varied: Varied 
 
 def mounts_at(m: mujoco.MjModel, device: wp.Device, varied: Varied | None = None, **mounted: np.ndarray) -> Mounts:
     """Returns what holds what is mounted, of which the fields of :class:`Mounts` are given up to ``mat``."""
-    count = np.ones(m.nbody, dtype=np.int32)
-    for b in range(m.nbody - 1, 0, -1):  # numbered along the tree: a subtree is a row of bodies
-        count[m.body_parentid[b]] += count[b]
+    count = subtree_masses(m, np.ones(m.nbody))  # bodies in each, which are numbered one after the other
     column = np.full(4 * m.nbody, -1)
     for first, name in ((0, "body_mass"), (m.nbody, "body_ipos")):
         if varied is not None and name in varied.places:
@@ -201,7 +198,7 @@ def triangles(m: mujoco.MjModel, geoms: list[int]) -> tuple[np.ndarray, np.ndarr
     points, faces, owner, count = [], [], [], 0
     for g in geoms:
         if m.geom_type[g] == BOX:
-            own, of_own = EDGES * m.geom_size[g], np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
+            own, of_own = DIAGONALS * m.geom_size[g], np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
         else:
             own, of_own = of_field(m, int(m.geom_dataid[g]))
         points.append(own @ axes_of(m.geom_quat[g]).T + m.geom_pos[g])
@@ -252,15 +249,15 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
     head, lights = m.vis.headlight, np.flatnonzero(m.light_active)
     is_spot = m.light_type != int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     ambient = m.light_ambient[lights][~is_spot[lights]].sum(0) + (head.ambient if head.active else 0.0)
-    shine, texture = np.zeros((m.ngeom, 3)), np.full(m.ngeom, -1)
-    repeat, offset, left_out = np.zeros((m.ngeom, 2)), np.zeros((m.ngeom, 2)), []
-    shine[:, 1:] = 0.5, 0.5 * FULL_SHINE
+    look, light = rows_of(Look, m.ngeom), rows_of(Light, 1 + len(lights))
+    look["color"] = np.reshape([color_of(m, g)[:3] for g in range(m.ngeom)], (-1, 3))
+    look["shine"], look["texture"], left_out = (0.0, 0.5, 0.5 * FULL_SHINE), -1, []
     role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
     flat = [t for t in range(m.ntex) if m.tex_type[t] == int(mujoco.mjtTexture.mjTEXTURE_2D)]
     for g in range(m.ngeom):
         if (material := int(m.geom_matid[g])) < 0:
             continue
-        shine[g] = m.mat_emission[material], m.mat_specular[material], FULL_SHINE * m.mat_shininess[material]
+        look["shine"][g] = m.mat_emission[material], m.mat_specular[material], FULL_SHINE * m.mat_shininess[material]
         used = int(m.mat_texid[material, role])
         is_ground = m.geom_bodyid[g] == 0 and m.geom_type[g] in (PLANE, BOX, FIELD)
         if used >= 0 and (not is_ground or used not in flat):
@@ -270,8 +267,9 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
             size = m.hfield_size[m.geom_dataid[g], :2] if m.geom_type[g] == FIELD else size
             ends = size > 0.0
             whole = ends & (not m.mat_texuniform[material])
-            texture[g], repeat[g] = flat.index(used), np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
-            offset[g] = np.where(ends.all(), repeat[g] * size, -0.5)
+            repeat = np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
+            look["texture"][g], look["repeat"][g] = flat.index(used), repeat
+            look["offset"][g] = np.where(ends.all(), repeat * size, -0.5)
     sees_through = [m.geom(g).name or str(g) for g in range(m.ngeom) if HIDDEN < color_of(m, g)[3] < 1.0]
     unknown = [m.geom(g).name or str(g) for g in range(m.ngeom) if m.geom_type[g] not in KINDS]
     for what, names in (
@@ -281,9 +279,6 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
     ):
         if names:
             logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
-    look, light = rows_of(Look, m.ngeom), rows_of(Light, 1 + len(lights))
-    look["color"] = np.reshape([color_of(m, g)[:3] for g in range(m.ngeom)], (-1, 3))
-    look["shine"], look["texture"], look["repeat"], look["offset"] = shine, texture, repeat, offset
     light["kind"][0] = OWN
     if head.active:
         light["diffuse"][0], light["specular"][0] = head.diffuse, head.specular
