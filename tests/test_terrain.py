@@ -160,7 +160,7 @@ def test_a_kind_of_ones_own_may_be_as_low_as_one_says():
     ("kinds", "settings", "message"),
     [
         ({}, {}, "kinds must be 1 to 20"),
-        ({"a": terrain.flat}, {"size": 1.05}, r"size \(1.05\) must be a multiple of cell \(0.1\)"),
+        ({"a": terrain.flat}, {"size": 1.05}, r"size \(1.05\) must be a whole multiple of cell \(0.1\)"),
         ({"a": (terrain.flat, -1.0)}, {}, "share of a"),
         ({"a": 3}, {}, "kind a must be a function"),
         ({"a": lambda difficulty: None}, {}, "kind a must take difficulty, generator, size and cell"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import POSITIVE, SEED, check_float, check_int, check_packages
+from torchrl_loco.checks import SEED, check_float, check_int, check_multiple, check_packages
 from torchrl_loco.config import read_mjcf
 from torchrl_loco.terrain.kinds import DEEP, Kind, Patch
 
@@ -62,8 +62,8 @@ class Terrain:
         seed: int = 0,
     ) -> None:
         self.rows, self.columns = check_int("rows", rows), check_int("columns", columns)
-        self.size, self.cell = check_float("size", size, POSITIVE), check_float("cell", cell, POSITIVE)
-        self.border, seed = check_float("border", border, POSITIVE), check_int("seed", seed, SEED)
+        self.size, self.cell = check_float("size", size), check_float("cell", cell)
+        self.border, seed = check_float("border", border), check_int("seed", seed, SEED)
         if not isinstance(kinds, Mapping):
             raise TypeError(f"kinds must be a dict of functions by name, got {kinds!r}")
         if wrong := [name for name, kind in kinds.items() if isinstance(kind, tuple) and len(kind) != 2]:
@@ -73,14 +73,10 @@ class Terrain:
             raise ValueError(f"{words}, as robots begin so far from the middle of a patch")
         if not kinds or len(kinds) > columns:
             raise ValueError(f"kinds must be 1 to {columns}, the number of columns, got {len(kinds)}")
-        if abs(size / cell - round(size / cell)) > 1e-6 or size < cell:
-            raise ValueError(f"size ({size:g}) must be a multiple of cell ({cell:g})")
+        side = check_multiple("size", self.size, "cell", self.cell)
         functions = {name: kind if isinstance(kind, tuple) else (kind, 1.0) for name, kind in kinds.items()}
-        self.kinds = self._of_columns(
-            {name: check_float(f"share of {name}", s, POSITIVE) for name, (_, s) in functions.items()}
-        )
+        self.kinds = self._of_columns({name: check_float(f"share of {name}", s) for name, (_, s) in functions.items()})
         self.difficulties = np.linspace(0.0, 1.0, rows) if rows > 1 else np.ones(1)
-        side = round(size / cell)
         self.heights = np.zeros((columns * side + 1, rows * side + 1))
         boxes = []
         for row, difficulty in enumerate(self.difficulties):
