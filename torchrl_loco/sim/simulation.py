@@ -143,7 +143,6 @@ class Simulation:
         check_memory(ENGINES[name].memory(setup), num_envs, device)
         self.engine = ENGINES[name](setup)
         self.model, self.data = self.engine.model, self.engine.data
-        self._batched: BatchedModel | None = None
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
         self._kernels = WorldKernels()
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
@@ -242,9 +241,11 @@ class Simulation:
             contacts: whether contacts and constraints are found too; that takes a part of a physics step.
         """
         with wp.ScopedDevice(self.device):  # not that on which the caller makes arrays
-            data, model = self.data, self._model_of_each_world()
+            data, model = self.data, self.model
             if not isinstance(data, mjw.Data):
-                data = self._mujoco_data
+                data, model, batched = self._of_mujoco_warp
+                if batched is not None:
+                    batched.update(self._every)
                 names = ["qpos", "qvel", "qacc_warmstart", "ctrl", "time"]
                 names += ["mocap_pos", "mocap_quat"] if self.mj_model.nmocap else []
                 names += ["act"] if self.mj_model.na else []
@@ -257,19 +258,14 @@ class Simulation:
         return data
 
     @functools.cached_property
-    def _mujoco_data(self) -> "mjw.Data":
+    def _of_mujoco_warp(self) -> "tuple[mjw.Data, mjw.Model, BatchedModel | None]":
+        """Data and model of MuJoCo-Warp, and what gives the model the numbers of each world, if they differ."""
         m, room = with_every_row(self.mj_model, self.varied), self.config
-        return mjw.make_data(m, self.num_envs, naconmax=room.naconmax, njmax=room.njmax)
-
-    def _model_of_each_world(self) -> "mjw.Model":
-        """Returns MuJoCo-Warp's model with the present numbers of each world."""
-        if self.varied is None or isinstance(self.data, mjw.Data):
-            return self.model
-        if self._batched is None:
-            with wp.ScopedDevice(self.device):
-                self._batched = BatchedModel(mjw.put_model(self.mj_model), self.varied, self.engine.numbers)
-        self._batched.update(self._every)
-        return self._batched.model
+        data = mjw.make_data(m, self.num_envs, naconmax=room.naconmax, njmax=room.njmax)
+        if self.varied is None:
+            return data, self.model, None
+        batched = BatchedModel(mjw.put_model(self.mj_model), self.varied, self.engine.numbers)
+        return data, batched.model, batched
 
     def compile(self, *launches: Callable[[], None]) -> None:
         """Compiles the kernels that ``launches`` would launch, in parallel and with a progress bar."""
