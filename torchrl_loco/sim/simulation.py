@@ -4,7 +4,6 @@ import functools
 import gc
 import logging
 import math
-import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import mujoco
 import torch
 import warp as wp
 
+from torchrl_loco.checks import Interval, check_int
 from torchrl_loco.config import CONVERGED, SimConfig
 from torchrl_loco.sim import compiled, mjw, models, mujoco_warp
 from torchrl_loco.sim import mujoco as c_mujoco
@@ -129,7 +129,9 @@ class Simulation:
         warn_of_integrator(mj_model, config)
         set_options(mj_model, config)
         say_what_is_only_seen(mj_model)
-        geoms = check_geoms(mj_model, contact_geoms)
+        geoms = tuple(check_int("each of contact_geoms", geom, Interval(0, mj_model.ngeom)) for geom in contact_geoms)
+        if len({*geoms}) < len(geoms):
+            raise ValueError(f"contact_geoms must name each geom once, got {geoms}")
         differing = varied if varied is not None and varied.count else None
         if config.engine == "mujoco" and device.type != "cpu":
             raise ValueError(f"engine='mujoco' is C MuJoCo, which computes on the CPU: pass device='cpu', got {device}")
@@ -327,18 +329,6 @@ def say_what_is_only_seen(mj_model: mujoco.MjModel) -> None:
         logging.getLogger("torchrl_loco").warning(
             "geoms that are meshes without contacts are drawn and touch nothing: %s%s", ", ".join(names[:3]), more
         )
-
-
-def check_geoms(mj_model: mujoco.MjModel, geoms: Sequence[int]) -> tuple[int, ...]:
-    """Returns ids of geoms; raises ValueError if one is out of range or named twice."""
-    ids = tuple(map(operator.index, geoms))
-    wrong = [geom for geom in ids if not 0 <= geom < mj_model.ngeom]
-    if wrong:
-        raise ValueError(f"contact_geoms must lie in [0, {mj_model.ngeom}), got {wrong}")
-    twice = sorted({geom for geom in ids if ids.count(geom) > 1})
-    if twice:
-        raise ValueError(f"contact_geoms must name each geom once, got {twice} twice")
-    return ids
 
 
 def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | None = None) -> tuple[str, str]:
