@@ -173,13 +173,7 @@ def why_no_cuda() -> str:
 
 
 def check_output_file(name: str, value: Any, suffixes: Collection[str] = ()) -> Path:
-    """Returns ``value`` as the absolute path of a file that can be created, which ends in one of ``suffixes``, if any.
-
-    Raises:
-        TypeError: it is no path.
-        ValueError: its folder does not exist or cannot be written to, a file is already there, or the suffix is none
-            of the valid ones.
-    """
+    """Returns ``value`` as the absolute path of a file that can be created, with one of ``suffixes``, if any."""
     path = Path(value).absolute()  # the working directory may change
     if suffixes and path.suffix not in suffixes:
         raise ValueError(f"{name} must end in one of {', '.join(suffixes)}, got {path}")
@@ -200,11 +194,7 @@ def checked_size(size: Any) -> tuple[int, int]:
 
 
 def check_run(path: Path) -> Path:
-    """Returns ``path`` as that of a run folder.
-
-    Raises:
-        FileNotFoundError: it is no folder with a ``config.json``.
-    """
+    """Returns ``path`` as that of a run folder, or raises FileNotFoundError if it has no ``config.json``."""
     if not is_run(path):
         inside = [entry for entry in Path(path).glob("*/") if is_run(entry)]
         newest = sorted(inside, key=lambda entry: (entry.stat().st_mtime, entry.name))[-5:]
@@ -219,11 +209,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_packages(purpose: str, packages: Collection[str], extra: str) -> None:
-    """Checks that packages, which an extra of this package installs, are there, without importing them.
-
-    Raises:
-        ImportError: one is not installed; the message says how to install it.
-    """
+    """Raises ImportError if a package that an extra of this one installs is missing; none is imported."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(

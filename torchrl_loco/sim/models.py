@@ -160,15 +160,7 @@ def touch_ground_only(mj_model: mujoco.MjModel) -> None:
 
 
 def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjModel:
-    """Returns the model if an environment supports it.
-
-    Args:
-        mj_model: the model that will be stepped.
-        own_control: whether the task computes controls itself, and need not scale actions to ranges.
-
-    Raises:
-        ValueError: the model uses something unsupported; the message names it.
-    """
+    """Returns a model, or raises ValueError if it is not supported; with ``own_control`` it needs no ranges."""
     wrong = []
     low, high = mj_model.actuator_ctrlrange.T
     if not own_control and not (low < high).all():

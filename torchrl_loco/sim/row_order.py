@@ -97,9 +97,6 @@ class RowOrder:
     """Sorts the constraint rows of every world by type, then by joint or pair of geoms.
 
     :meth:`apply` moves the rows of ``data``, between ``mujoco_warp.step1`` and ``step2``.
-
-    Raises:
-        ValueError: the model has something else whose order varies.
     """
 
     def __init__(self, model: "mjw.Model", data: "mjw.Data") -> None:

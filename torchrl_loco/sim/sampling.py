@@ -241,13 +241,7 @@ def draw_orientation_above_floor(world: int, args: RootAboveFloor, stream: wp.ui
 
 
 def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:
-    """Returns the outline of a model of one tree on a free joint, in its default pose and the frame of the root.
-
-    Geom 0 is the floor below it.
-
-    Raises:
-        ValueError: the model has another kind of geom.
-    """
+    """Returns the outline of a tree on a free joint, in its default pose and the root's frame; geom 0 is the floor."""
     m, data, kinds = mj_model, mujoco.MjData(mj_model), mujoco.mjtGeom
     mujoco.mj_kinematics(m, data)
     root, size = data.xmat[1].reshape(3, 3), m.geom_size[1:]
@@ -270,16 +264,7 @@ def make_outline(mj_model: mujoco.MjModel, device: wp.Device) -> Outline:
 
 
 def make_skeleton(mj_model: mujoco.MjModel, pairs: np.ndarray, device: wp.Device) -> Skeleton:
-    """Returns the skeleton of a model of free joints, hinges, capsules and spheres on a floor at z = 0.
-
-    Args:
-        mj_model: the model, whose geom 0 is the floor.
-        pairs: geoms that may touch, lower id first, shape ``(npair, 2)``.
-        device: where the arrays live.
-
-    Raises:
-        ValueError: the model has another kind of joint or geom.
-    """
+    """Returns the skeleton of a model; ``pairs`` are the geoms that may touch, lower id first, ``(npair, 2)``."""
     m, joint, geom = mj_model, mujoco.mjtJoint, mujoco.mjtGeom
     if (
         m.geom_type[0] != geom.mjGEOM_PLANE

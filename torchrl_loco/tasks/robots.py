@@ -62,11 +62,7 @@ class Robot(LocoEnv):
 
     @classmethod
     def check_model(cls, mj_model: mujoco.MjModel) -> None:
-        """Checks what the formulas take for granted of a robot.
-
-        Raises:
-            ValueError: something of :meth:`faults`.
-        """
+        """Raises ValueError for :meth:`faults` of a model, which the formulas take for granted not to be there."""
         if wrong := cls.faults(mj_model):
             raise ValueError(f"the model of {cls.__name__} does not do for this task: {'; '.join(wrong)}")
 

@@ -238,14 +238,7 @@ class Tracking(Robot):
         }
 
     def _frames(self) -> motions.Frames:
-        """Returns the motions as tables, which environments that are made one after the other share.
-
-        Those of a running training go on without its files.
-
-        Raises:
-            FileNotFoundError: a file is not there.
-            ValueError: no motion is named, and the robot has none.
-        """
+        """Returns the motions as tables, which environments that are made one after the other share."""
         given, fps = (self.motion, self.fps) if "motion" in self.options_given else ([], OWN_RATE)
         if not given and not hasattr(self, "motion_folder"):
             raise ValueError(f"{type(self).__name__} has no motions of its own: pass motion, or set motion_folder")
@@ -257,6 +250,7 @@ class Tracking(Robot):
         except FileNotFoundError:
             if key not in _tables:
                 raise
+            # a training that runs goes on without its files
             return _tables[key][1]
         if key not in _tables or _tables[key][0] != stamp:
             _tables.clear()
