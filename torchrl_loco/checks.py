@@ -123,18 +123,12 @@ def check_fields(config: Any) -> None:
 
     It may be frozen and just being made. Fields that are not made by :func:`within` are positive.
     """
+    checks: dict[Any, Any] = {bool: check_bool, int: check_int, float: check_float, float | None: check_float}
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        interval = [field.metadata["interval"]] if "interval" in field.metadata else []  # else that of the check
-        if value is None and field.type == float | None:
-            continue
-        if field.type is bool:
-            value = check_bool(field.name, value)
-        elif field.type is int:
-            value = check_int(field.name, value, *interval)
-        elif field.type in (float, float | None):
-            value = check_float(field.name, value, *interval)
-        object.__setattr__(config, field.name, value)
+        value, check = getattr(config, field.name), checks.get(field.type)
+        if check is not None and not (value is None and field.type == float | None):
+            interval = [field.metadata["interval"]] if "interval" in field.metadata else []  # else that of the check
+            object.__setattr__(config, field.name, check(field.name, value, *interval))
 
 
 def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
