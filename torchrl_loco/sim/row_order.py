@@ -100,7 +100,18 @@ class RowOrder:
     """
 
     def __init__(self, model: "mjw.Model", data: "mjw.Data") -> None:
-        check_order(model)
+        most = model.block_dim.contact_jac_tiled
+        others = {  # what else varies in order before the solver starts
+            "a sparse Jacobian": model.is_sparse,
+            "elliptic friction cones": model.opt.cone == mjw.ConeType.ELLIPTIC,
+            "gravity compensation": bool(model.body_gravcomp.numpy().any()),
+            "tendons": model.ntendon > 0,
+            "flexes": model.nflex > 0,
+            # Beyond it several blocks of threads add to one row.
+            f"more than {most} degrees of freedom": model.nv > most,
+        }
+        if found := [name for name, here in others.items() if here]:
+            raise ValueError(f"deterministic=True does not support models with {', '.join(found)}: leave it out")
         self._data = data
         self._rank = wp.zeros((data.nworld, data.njmax), dtype=int, device=data.qpos.device)
         fields = [getattr(data.efc, name) for name in ROW_FIELDS]
@@ -116,20 +127,3 @@ class RowOrder:
             wp.launch(move_rows, dim=dim, inputs=[d.nefc, self._rank], outputs=[rows], device=device)
         inputs, addresses = [d.nacon, d.contact.worldid, self._rank], d.contact.efc_address
         wp.launch(follow_rows, dim=addresses.shape, inputs=inputs, outputs=[addresses], device=device)
-
-
-def check_order(model: "mjw.Model") -> None:
-    """Raises ValueError if more than constraint rows varies in order before the solver starts."""
-    most = model.block_dim.contact_jac_tiled
-    others = {
-        "a sparse Jacobian": model.is_sparse,
-        "elliptic friction cones": model.opt.cone == mjw.ConeType.ELLIPTIC,
-        "gravity compensation": bool(model.body_gravcomp.numpy().any()),
-        "tendons": model.ntendon > 0,
-        "flexes": model.nflex > 0,
-        # Beyond it several blocks of threads add to one row.
-        f"more than {most} degrees of freedom": model.nv > most,
-    }
-    found = [name for name, here in others.items() if here]
-    if found:
-        raise ValueError(f"deterministic=True does not support models with {', '.join(found)}: leave it out")
