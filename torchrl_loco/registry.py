@@ -356,15 +356,8 @@ _reading: list[Path] = []  # files that run now because a class in them was name
 
 
 def check_is_run() -> None:
-    """Ends the reading of a script that trains outside of ``if __name__ == "__main__"``: it does not train twice.
-
-    Where its class was named, the reading ends here, and what is defined above is found.
-
-    Raises:
-        RuntimeError: a process that the script has started reads it.
-        _ReadEnough: this process does, for a class.
-    """
-    if _reading:
+    """Ends the reading of a script that trains outside of ``if __name__ == "__main__"``: it does not train twice."""
+    if _reading:  # for a class, which is found if it is defined above
         raise _ReadEnough
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise RuntimeError(

@@ -87,11 +87,7 @@ class Graph:
         self._graph = capture.graph
 
     def __call__(self, *args: Any) -> None:
-        """Runs them on torch's current stream, without waiting for the device.
-
-        Args:
-            args: of ``launch``, where it joins torch's recording; in a replay they are those of its recording.
-        """
+        """Runs them on torch's current stream, without a wait; ``args`` are for where they join torch's recording."""
         if not torch_is_recording(self._device):
             self.replay()
             return

@@ -43,12 +43,7 @@ class Robot(LocoEnv):
 
     @classmethod
     def check_class(cls) -> None:
-        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
-
-        Raises:
-            TypeError: an attribute is missing, or has the wrong type.
-            ValueError: ``verify`` would ask for more than :attr:`longest_delay`; ``action_scale`` is not positive.
-        """
+        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does."""
         if missing := [name for name in cls.table if not hasattr(cls, name)]:
             of = definer(cls, "table").__name__
             raise TypeError(f"{cls.__name__} must set {', '.join(missing)}: see help(torchrl_loco.{of})")

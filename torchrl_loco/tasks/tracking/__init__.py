@@ -147,12 +147,7 @@ class Tracking(Robot):
 
     @classmethod
     def check_class(cls) -> None:
-        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does.
-
-        Raises:
-            TypeError: an attribute is missing, or has the wrong type.
-            ValueError: the base is not the first of :attr:`bodies`, or the anchor or an end is not among them.
-        """
+        """Checks the table of the robot beside what :meth:`torchrl_loco.LocoEnv.check_class` does."""
         super().check_class()
         bodies = list(cls.bodies)
         if apart := [name for name in (cls.base, cls.anchor, *cls.ends) if name not in bodies]:
@@ -171,12 +166,7 @@ class Tracking(Robot):
 
     @classmethod
     def checked_options(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns options as a run keeps them: with the whole paths of files.
-
-        Raises:
-            ValueError: there is no such option, or a value is out of range.
-            TypeError: a motion is neither a path nor a :class:`torchrl_loco.Motion`.
-        """
+        """Returns options as a run keeps them: with the whole paths of files."""
         kept = super().checked_options(given)
         if "motion" in kept:
             several = kept["motion"] if isinstance(kept["motion"], list | tuple) else [kept["motion"]]
