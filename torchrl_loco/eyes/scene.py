@@ -261,7 +261,7 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
         used = int(m.mat_texid[material, role])
         is_ground = m.geom_bodyid[g] == 0 and m.geom_type[g] in (PLANE, BOX, FIELD)
         if used >= 0 and (not is_ground or used not in flat):
-            left_out.append(m.geom(g).name or str(g))
+            left_out.append(g)
         elif used >= 0:  # texels are counted from a corner, or from the middle of ground without an end
             size, times = m.geom_size[g, :2], m.mat_texrepeat[material]
             size = m.hfield_size[m.geom_dataid[g], :2] if m.geom_type[g] == FIELD else size
@@ -270,14 +270,13 @@ def looks_of(m: mujoco.MjModel, device: wp.Device) -> Looks:
             repeat = np.where(whole, times / np.where(whole, 2 * size, 1), 0.5 * times)
             look["texture"][g], look["repeat"][g] = flat.index(used), repeat
             look["offset"][g] = np.where(ends.all(), repeat * size, -0.5)
-    sees_through = [m.geom(g).name or str(g) for g in range(m.ngeom) if HIDDEN < color_of(m, g)[3] < 1.0]
-    unknown = [m.geom(g).name or str(g) for g in range(m.ngeom) if m.geom_type[g] not in KINDS]
-    for what, names in (
-        ("textures but those of the ground", left_out),
-        ("transparency", sees_through),
-        ("shapes of such a type", unknown),
-    ):
-        if names:
+    unseen = {
+        "textures but those of the ground": left_out,
+        "transparency": [g for g in range(m.ngeom) if HIDDEN < color_of(m, g)[3] < 1.0],
+        "shapes of such a type": [g for g in range(m.ngeom) if m.geom_type[g] not in KINDS],
+    }
+    for what, geoms in unseen.items():
+        if names := [m.geom(g).name or str(g) for g in geoms]:
             logging.getLogger("torchrl_loco").info("cameras do not see %s: geoms %s", what, ", ".join(names[:8]))
     light["kind"][0] = OWN
     if head.active:

@@ -79,8 +79,7 @@ def spheres(m: mujoco.MjModel, geom: int) -> list[tuple[np.ndarray, float]]:
         places = [(*((size[0] - radius) * d[:2] / np.sqrt(2)), d[2] * (size[2] - radius)) for d in DIAGONALS]
     elif kind == MESH:
         mesh = m.geom_dataid[geom]
-        start = m.mesh_vertadr[mesh]
-        vertices = m.mesh_vert[start : start + m.mesh_vertnum[mesh]]
+        vertices = m.mesh_vert[m.mesh_vertadr[mesh] :][: m.mesh_vertnum[mesh]]
         corners = [vertices[np.argmax(vertices @ (d / size))] for d in DIAGONALS]
         places = [corner * max(0.0, 1.0 - radius / np.linalg.norm(corner)) for corner in np.unique(corners, axis=0)]
     else:
