@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
-from torch import nn
+from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ValueOperator
@@ -75,11 +75,11 @@ class PPO(Algorithm):
         self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
         self._lr_factors = torch.tensor([1.0, 1.5, 1.0, 1 / 1.5], device=self.device)
 
-    def _read(self, td: TensorDictBase, key: str) -> torch.Tensor:
+    def _read(self, td: TensorDictBase, key: str) -> Tensor:
         """Returns pixels as they are; other entries normalised, with zeros up to the length of the rows of weights."""
         return normalised(td[key], self.norms[key], self._dtype) if key in self.norms else td[key]
 
-    def _std(self) -> torch.Tensor:
+    def _std(self) -> Tensor:
         """Returns the standard deviations of actions, the same in all states, shape ``(nu,)``."""
         return self._scale(torch.zeros(self.spaces.action, device=self.device))[1]
 
@@ -113,16 +113,14 @@ class PPO(Algorithm):
         read = {"action": action, "log_prob": log_prob, "advantage": advantage, "value_target": target}
         return TensorDict({**now, **read}, batch.batch_size)
 
-    def _values(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
+    def _values(self, rows: Tensor, weights: Mapping[nn.Parameter, Tensor]) -> Tensor:
         """Returns what the critic expects of a batch, ``(num_envs, num_steps, 1)``."""
         if not self.spaces.critic_sees:
             return self._value(rows, weights).float()
         # Step by step: a whole batch would fill the memory with what convolutions give.
         return torch.stack([self._value(step, weights).float() for step in rows.unbind(1)], dim=1)
 
-    def _estimates(
-        self, value: torch.Tensor, later: torch.Tensor, after: TensorDictBase
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _estimates(self, value: Tensor, later: Tensor, after: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Returns generalised advantage estimates and the critic's targets, of shape ``(num_envs, num_steps, 1)``.
 
         At a time limit the value of the true terminal observation is bootstrapped; termination ends the return.
@@ -137,7 +135,7 @@ class PPO(Algorithm):
         whole = torch.stack(advantages[::-1], dim=1)
         return whole, whole + value
 
-    def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
+    def gradient_step(self, minibatch: TensorDictBase) -> Iterable[Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
         config, weights = self.config, self.optimizer.wide(self._dtype)
         with self.beside():  # as are the slopes of what is computed there
@@ -156,7 +154,7 @@ class PPO(Algorithm):
         if not self.config.target_kl:
             super().schedule(progress)
 
-    def _follow(self, kl: torch.Tensor) -> None:
+    def _follow(self, kl: Tensor) -> None:
         """Lowers the learning rate where a step goes too far from the policy that collected, raises it where not far.
 
         A divergence that is not positive, as that of the first step of a batch, says nothing.
@@ -189,7 +187,7 @@ def normalise_of(dtype: torch.dtype) -> wp.Kernel:
 
 
 @torch.no_grad()
-def normalised(rows: torch.Tensor, norm: ObservationNorm, dtype: torch.dtype) -> torch.Tensor:
+def normalised(rows: Tensor, norm: ObservationNorm, dtype: torch.dtype) -> Tensor:
     """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``ALIGNED``."""
     norm.check(rows)
     wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // ALIGNED) * ALIGNED, dtype=dtype)
@@ -235,7 +233,7 @@ def draw_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
 
 
 @torch.no_grad()
-def drawn(mean: torch.Tensor, std: torch.Tensor, noise: torch.Tensor, bounded: bool) -> tuple[torch.Tensor, ...]:
+def drawn(mean: Tensor, std: Tensor, noise: Tensor, bounded: bool) -> tuple[Tensor, ...]:
     """Returns actions and their log-probabilities; and if tanh bounds them, what they were before it.
 
     Means and standard normal noise have shape ``(n, nu)``, standard deviations ``(nu,)``.
@@ -318,13 +316,13 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
 
 @torch.no_grad()
 def clipped_loss(
-    mean: torch.Tensor,
-    std: torch.Tensor,
-    value: torch.Tensor,
-    data: Mapping[str, torch.Tensor],
+    mean: Tensor,
+    std: Tensor,
+    value: Tensor,
+    data: Mapping[str, Tensor],
     config: PPOConfig,
     bounded: bool,
-) -> tuple[torch.Tensor, ...]:
+) -> tuple[Tensor, ...]:
     """Computes the slopes of PPO's loss: clipped objective, smooth L1 error of the critic and entropy bonus.
 
     It is the loss of TorchRL's ``ClipPPOLoss`` with advantages normalised by minibatch. ``mean``, ``(n, nu)``, and
@@ -357,13 +355,13 @@ class Affine(torch.autograd.Function):
     """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long."""
 
     @staticmethod
-    def forward(ctx: Any, rows: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
+    def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Returns what the layer gives, shape ``(..., outputs)``."""
         ctx.save_for_backward(rows, weight)
         return nn.functional.linear(rows, weight, bias)
 
     @staticmethod
-    def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """Returns the slopes by rows, weight and bias."""
         (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
         of_bias = (slope.new_ones(1, len(slope)) @ slope)[0] if by_bias else None
@@ -390,7 +388,7 @@ class Rows:
                 found, expected = nn.Sequential(*layers)(rows.clone()), network(rows.clone())
             self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
 
-    def __call__(self, rows: torch.Tensor, weights: Mapping[nn.Parameter, torch.Tensor]) -> torch.Tensor:
+    def __call__(self, rows: Tensor, weights: Mapping[nn.Parameter, Tensor]) -> Tensor:
         """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well."""
         if self._encoder:
             own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}

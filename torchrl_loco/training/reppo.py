@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, mse_loss
 from torchrl.objectives.utils import hold_out_net
 from torchrl.objectives.value.functional import td_lambda_return_estimate
@@ -68,7 +68,7 @@ class REPPO(Algorithm):
         """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
         return Acting(self.actor, self.fused(self.actor, "the actor"))
 
-    def _read(self, td: TensorDictBase) -> dict[str, torch.Tensor]:
+    def _read(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Returns what networks read of a batch, by entry: rows of numbers normalised, pixels as they are."""
         rows = {key: norm(td[key]) for key, norm in self.norms.items()}
         return rows | ({"pixels": td["pixels"]} if self.spaces.pixels else {})
@@ -99,7 +99,7 @@ class REPPO(Algorithm):
         action = batch["action"] / self.action_bound  # what the losses see lies in [-1, 1]
         return batch.select("loc", "scale").update({"action": action, **now, **estimates})
 
-    def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
+    def batch_metrics(self, data: TensorDictBase) -> Tensor:
         """Returns least and largest return of a batch, and the fraction beyond the critic's bins by more than a bin."""
         returns, bins = data["returns"], self.critic.bins
         least, largest = returns.aminmax()
@@ -124,19 +124,17 @@ class REPPO(Algorithm):
             f"{' '.join(options)}, or a smaller --reward_scale"
         )
 
-    def gradient_step(self, minibatch: TensorDictBase) -> Iterable[torch.Tensor]:
+    def gradient_step(self, minibatch: TensorDictBase) -> Iterable[Tensor]:
         """Returns the metrics, a scalar each, of a step of the critic, then one of the actor and the dual variables."""
         return [*self.critic_step(minibatch), *self.actor_step(minibatch)]
 
-    def _values(
-        self, observation: torch.Tensor, of_critic: torch.Tensor, noise: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _values(self, observation: Tensor, of_critic: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns log-probability, value and features of one action in each state, made of standard normal noise."""
         loc, scale = self.distribution(observation)
         action, log_prob = sample(loc, scale, noise)
         return log_prob, *self.critic.value_and_features(of_critic, action)
 
-    def critic_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
+    def critic_step(self, minibatch: TensorDictBase) -> list[Tensor]:
         """Returns the metrics of the critic, which learns to predict returns and its own features of the next step."""
         names = self.spaces.critic_key, "action", "returns", "features", "alive"
         loss, aux = self._compiled_critic_losses(*(minibatch[name] for name in names))
@@ -147,18 +145,18 @@ class REPPO(Algorithm):
 
     def _critic_losses(
         self,
-        observation: torch.Tensor,
-        action: torch.Tensor,
-        returns: torch.Tensor,
-        features: torch.Tensor,
-        alive: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        observation: Tensor,
+        action: Tensor,
+        returns: Tensor,
+        features: Tensor,
+        alive: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
         logits, predicted = self.critic(observation, action)
         aux = (mse_loss(predicted, features, reduction="none").mean(-1) * alive).mean()
         return cross_entropy(logits, self.critic.bins.encode(returns)), aux
 
-    def actor_step(self, minibatch: TensorDictBase) -> list[torch.Tensor]:
+    def actor_step(self, minibatch: TensorDictBase) -> list[Tensor]:
         """Returns the metrics of the actor: it ascends value and entropy near the old policy, and goes back to it."""
         config, temperature, kl_weight = self.config, self.dual.temperature, self.dual.kl_weight
         names = self.spaces.critic_key, "loc", "scale"
@@ -178,14 +176,14 @@ class REPPO(Algorithm):
 
     def _actor_losses(
         self,
-        observation: torch.Tensor,
-        of_critic: torch.Tensor,
-        old_loc: torch.Tensor,
-        old_scale: torch.Tensor,
-        noise: torch.Tensor,
-        temperature: torch.Tensor,
-        kl_weight: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        observation: Tensor,
+        of_critic: Tensor,
+        old_loc: Tensor,
+        old_scale: Tensor,
+        noise: Tensor,
+        temperature: Tensor,
+        kl_weight: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Returns the actor's loss, and without gradients mean entropy, mean divergence and how often it is too large.
 
         All are scalars, of ``n`` steps; the last one is a fraction of them.
@@ -216,17 +214,17 @@ class DualVariables(nn.Module):
         self.log_kl_weight.clamp_(min=self._min_log_kl_weight)
 
     @property
-    def temperature(self) -> torch.Tensor:
+    def temperature(self) -> Tensor:
         """Weight of the entropy, a scalar."""
         return self.log_temperature.exp()
 
     @property
-    def kl_weight(self) -> torch.Tensor:
+    def kl_weight(self) -> Tensor:
         """Weight of the divergence, a scalar."""
         return self.log_kl_weight.exp()
 
 
-def sample(loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def sample(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Returns actions ``tanh(u)``, u = loc + scale * noise, and their log-probabilities, shape ``(...)``.
 
     Standard normal noise, means and standard deviations have shape ``(..., nu)``. The log-probability is computed from
@@ -237,7 +235,7 @@ def sample(loc: torch.Tensor, scale: torch.Tensor, noise: torch.Tensor) -> tuple
     return u.tanh(), log_prob.sum(-1)
 
 
-def kl(old_loc: torch.Tensor, old_scale: torch.Tensor, loc: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def kl(old_loc: Tensor, old_scale: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
     """Returns KL(old || new) of diagonal Gaussians, shape ``(...)``, which equals that of their images under tanh.
 
     Means and standard deviations have shape ``(..., nu)``.
@@ -257,8 +255,8 @@ class ValueBins(nn.Module):
 
     SPREAD = 0.75  # standard deviation of a target, in widths of a bin
 
-    centers: torch.Tensor  # of the bins, (count,)
-    edges: torch.Tensor  # (count + 1,)
+    centers: Tensor  # of the bins, (count,)
+    edges: Tensor  # (count + 1,)
 
     def __init__(self, low: float, high: float, count: int) -> None:
         super().__init__()
@@ -268,13 +266,13 @@ class ValueBins(nn.Module):
         self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
         self.width = 2 * half
 
-    def encode(self, returns: torch.Tensor) -> torch.Tensor:
+    def encode(self, returns: Tensor) -> Tensor:
         """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
         returns = returns.clamp(self.low, self.high).unsqueeze(-1)
         below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
         return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
 
-    def decode(self, logits: torch.Tensor) -> torch.Tensor:
+    def decode(self, logits: Tensor) -> Tensor:
         """Returns the mean, shape ``(...)``, of distributions given as logits of shape ``(..., count)``."""
         return (logits.softmax(-1) * self.centers).sum(-1)
 
@@ -301,16 +299,16 @@ class DistributionalQ(nn.Module):
             nn.LayerNorm(width), nn.SiLU(), *normed_layers(width, (width,)), nn.Linear(width, width)
         )
 
-    def forward(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
         features = self._features(observation, action)
         return self.value_head(features), self.predictor(features)
 
-    def value_and_features(self, observation: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def value_and_features(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""
         features = self._features(observation, action)
         return self.bins.decode(self.value_head(features)), features
 
-    def _features(self, observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    def _features(self, observation: Tensor, action: Tensor) -> Tensor:
         seen = self.sight(observation) if self.sight else observation
         return self.encoder(torch.cat([seen, action], dim=-1))

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
-from torch import nn
+from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor
 
 from torchrl_loco.envs import LocoEnv
@@ -122,7 +122,7 @@ class SVG(Algorithm):
         """Refuses, likewise."""
         raise NotImplementedError("svg learns from windows of several batches")
 
-    def update(self, batch: TensorDictBase, progress: float) -> torch.Tensor:
+    def update(self, batch: TensorDictBase, progress: float) -> Tensor:
         """Returns the means of the metrics over all rounds of an update, zeros until a window is remembered."""
         self.adopt()
         self.schedule(progress)
@@ -183,15 +183,15 @@ class SVG(Algorithm):
         self._add("loss_model", loss, by_step[0], by_step[-1], *self._descend(self._model_optimizers, loss))
 
     def _moved(
-        self, qpos: torch.Tensor, qvel: torch.Tensor, ctrl: torch.Tensor, after: torch.Tensor, event: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, after: Tensor, event: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns predicted positions and velocities with what events changed, and the error without."""
         qpos, qvel = self.model(qpos, qvel, ctrl)
         return qpos, qvel + event, self.model.errors(qpos, qvel, after)
 
     # Actor and critic.
 
-    def improve(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.cuda.Event | None]:
+    def improve(self) -> tuple[Tensor, Tensor, Tensor, torch.cuda.Event | None]:
         """Makes a gradient step of the actor, in steps that are imagined from remembered states on.
 
         Returns:
@@ -208,9 +208,7 @@ class SVG(Algorithm):
         self._add("grad_norm_actor", *of_actor)
         return *lesson, exists
 
-    def value(
-        self, seen: torch.Tensor, aims: torch.Tensor, weight: torch.Tensor, exist: torch.cuda.Event | None
-    ) -> None:
+    def value(self, seen: Tensor, aims: Tensor, weight: Tensor, exist: torch.cuda.Event | None) -> None:
         """Makes a gradient step of the critic; the arguments are what :meth:`improve` returns."""
         if exist is not None:
             torch.cuda.current_stream(self.device).wait_event(exist)
@@ -227,15 +225,13 @@ class SVG(Algorithm):
         ):
             torch._foreach_lerp_(list(mine.parameters()), list(new.parameters()), rate)
 
-    def _returned(
-        self, rewards: torch.Tensor, values: torch.Tensor, ended: torch.Tensor, cut: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _returned(self, rewards: Tensor, values: Tensor, ended: Tensor, cut: Tensor) -> tuple[Tensor, Tensor]:
         """Returns lambda-returns from each step on, and whether the episode goes on before it."""
         over = (ended | cut)[:-1].float()
         alive = torch.cat([torch.ones_like(rewards[:1]), (1.0 - over).cumprod(0)])
         return lambda_returns(rewards, values, ended, cut, self.config.gamma, self.config.lmbda), alive
 
-    def _imagine(self) -> tuple[torch.Tensor, ...]:
+    def _imagine(self) -> tuple[Tensor, ...]:
         """Returns rewards, whether episodes terminated and were cut off, and what the critic reads after each step.
 
         Each is ``(horizon, n, ...)``; what comes after an end does not count.
@@ -261,12 +257,12 @@ class SVG(Algorithm):
 
     def _dreamt(
         self,
-        observation: torch.Tensor,
-        qpos: torch.Tensor,
-        qvel: torch.Tensor,
-        noise: torch.Tensor,
-        *rest: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        observation: Tensor,
+        qpos: Tensor,
+        qvel: Tensor,
+        noise: Tensor,
+        *rest: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the actions that standard normal noise makes, and the positions and velocities they lead to."""
         action = self._mean(self.norms["observation"](observation)).float() + self.config.init_std * noise
         action = action.tanh() if self.spaces.bounded else action
@@ -274,7 +270,7 @@ class SVG(Algorithm):
             ctrl = self._imagined.control(qpos, qvel, action, rest)
         return action, *self._known(qpos, qvel, ctrl)
 
-    def _valued(self, rows: torch.Tensor) -> torch.Tensor:
+    def _valued(self, rows: Tensor) -> Tensor:
         """Returns the values that returns are made with, ``(n, 1)``."""
         return self._target(self.critic[0](rows)).float()
 
@@ -291,7 +287,7 @@ class SVG(Algorithm):
         self.optimizers[f"{name} matrices"] = Muon(matrices, torch.tensor(self.config.lr, device=self.device))
         return [rest, self.optimizers[f"{name} matrices"]]
 
-    def _descend(self, optimizers: Iterable[Any], loss: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _descend(self, optimizers: Iterable[Any], loss: Tensor) -> tuple[Tensor, Tensor]:
         """Makes a step of each optimizer, of zeros if a number of the gradient is not finite.
 
         Returns:
@@ -311,7 +307,7 @@ class SVG(Algorithm):
             clip_and_step(optimizer, self.config.max_grad_norm)
         return norm.nan_to_num(0.0, 0.0, 0.0), is_lost
 
-    def _add(self, first: str, *values: torch.Tensor) -> None:
+    def _add(self, first: str, *values: Tensor) -> None:
         """Adds metrics to their totals, from the one that is named on."""
         at = self.metric_names.index(first)
         self._totals[at : at + len(values)] += torch.stack([value.detach().float() for value in values])
@@ -337,9 +333,7 @@ class SVG(Algorithm):
             print("svg remembers steps anew: the run differs from one that was not stopped", file=sys.stderr)
 
 
-def lambda_returns(
-    rewards: torch.Tensor, values: torch.Tensor, ended: torch.Tensor, cut: torch.Tensor, gamma: float, lmbda: float
-) -> torch.Tensor:
+def lambda_returns(rewards: Tensor, values: Tensor, ended: Tensor, cut: Tensor, gamma: float, lmbda: float) -> Tensor:
     """Returns lambda-returns from each step on, ``(steps, n)`` as all arguments, through which gradients flow.
 
     Values are of the states after steps. Nothing follows where an episode ended; where it was cut off, the value does.
