@@ -213,7 +213,7 @@ class WorldAccess(Task, EnvBase):
         - ``solver_failure``: the solver of ``compiled`` found no step, or lacked digits: accelerations may be wrong.
         - ``index_error``: a hook indexed one of its ``constants`` or ``shared`` out of range, which gave NaN.
         - ``non_finite``: the world became non-finite, and terminated: its positions, velocities, accelerations,
-          observation, reward, memory or action were no numbers, or 1e10 and more, as C MuJoCo has it.
+          observation, reward or memory were no numbers, or 1e10 and more, as C MuJoCo has it, or its action was none.
 
         ``"peak"`` holds the largest number of ``constraints`` in a world and of ``contacts`` in all worlds that a
         physics step needed; use it to choose ``njmax`` and ``naconmax``. Nothing waits for the device until you read a

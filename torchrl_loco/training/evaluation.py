@@ -79,7 +79,7 @@ class Evaluator:
             metrics, terms = after.get("metrics", {}), after.get("reward_terms", {})
             signals = [after[name].unbind(1) for name in ("reward", "done", "terminated")]
             for t, (reward, done, terminated) in enumerate(zip(*signals, strict=True)):
-                returns += reward * alive
+                returns += torch.where(alive, reward, 0.0)
                 steps += alive
                 cut_off |= alive & done & ~terminated
                 for name, values in metrics.items():
@@ -87,7 +87,7 @@ class Evaluator:
                     sums[name] = sums.get(name, 0.0) + torch.where(counted, values[:, t], 0.0)
                     counts[name] = counts.get(name, 0.0) + counted
                 for name, values in terms.items():
-                    earned[name] = earned.get(name, 0.0) + values[:, t] * alive
+                    earned[name] = earned.get(name, 0.0) + torch.where(alive, values[:, t], 0.0)
                 alive &= ~done
             if not alive.any():
                 break
