@@ -1,6 +1,7 @@
 """Wrong answers that were found in the compiled step, one by one, and what it refuses since."""
 
 import functools
+import re
 from pathlib import Path
 
 import mujoco
@@ -491,6 +492,32 @@ def test_a_body_builds_for_a_gpu(dofs, kind, varied, asked, arch, tmp_path, monk
         kernel.module, arch=arch, module_dir=tmp_path / str(dofs), use_ptx=False, strip_hash=True
     )
     assert built.suffix == ".cubin"
+
+
+ROUND_OVER_FIELD = """<mujoco>
+  <asset><hfield name="h" nrow="3" ncol="3" size="2 2 1 1" elevation="0 1 0 1 0 1 0 1 0"/></asset>
+  <worldbody>
+    <geom type="hfield" hfield="h"/>
+    <body pos="0 0 3">
+      <freejoint/>
+      <geom size="0.2"/>
+      <body pos="0.5 0 0"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.05"/></body>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without NVRTC")
+def test_lanes_keep_what_they_have_in_registers(tmp_path, monkeypatch):
+    """What lies in memory takes longer, and if it is a pointer to shared memory, so does all that it points to."""
+    monkeypatch.setattr(step, "TRACED_DOFS", 0)
+    model = mujoco.MjModel.from_xml_string(ROUND_OVER_FIELD)
+    kernel = _kernel(step.source(model, 2), Chain(()), Chain(()), lanes.Description(model).registers())
+    kernel.module.options["optimization_level"] = 3
+    (built,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True, strip_hash=True)
+    spaces = set(re.findall(r"\b(?:ld|st)\.(?:v\d\.)?([a-z]+)", built.read_text()))
+    assert spaces == {"shared", "global", "param"}, spaces
 
 
 @in_both_forms
