@@ -269,13 +269,6 @@ static INLINE Touch out_of(const Prism& p, Vec half) {
   return {-depth, normal, edge.at(points.second[0]), axis.at(points.first[0])};
 }
 
-// Whether a geom may touch a prism below it, by the planes of its upper and its slanted face.
-INLINE bool reaches(const Over& o, const Prism& p, int k, float most, int pair) const {
-  const int slanted = k & 1 ? 4 : 2;
-  const float r = w.geoms[Model::second_geom(pair)].radius + Model::margin(pair) + 1e-6f;
-  return most >= o.center.z - o.reach.z && above(p, 0, o.half) <= r && above(p, slanted, o.half) <= r;
-}
-
 INLINE void touch_prisms(int field, const int count, const bool friction) {
   ROLLED_FOR(int base = 0; base < count; base += LANES) {
     const bool valid = base + lane < count;
@@ -284,14 +277,13 @@ INLINE void touch_prisms(int field, const int count, const bool friction) {
     const Over o = over(field, pair);
     float most;
     const Prism p = prism(field, o, k, most);
-    const bool near = valid && reaches(o, p, k, most, pair);
     Touch touch;
     const bool landed = lands(p, o.half, touch);
     const bool is_point = o.half.dot(o.half) < MINVAL && p.low < 0.0f;
     // What is as high as all of its corners is nearest to an edge of the upper face, if not to that.
     const bool is_over = o.center.z - fabsf(o.half.z) >= most;
-    if (near && !landed && is_point) touch = of_point(p, is_over);
-    if (near && !landed && !is_point) {
+    if (!landed && is_point) touch = of_point(p, is_over);
+    if (!landed && !is_point) {
       const bool inside = !is_over && crosses(p, o.half);
       touch = inside ? out_of(p, o.half) : apart_from(p, o.half, is_over);
     }
@@ -300,9 +292,19 @@ INLINE void touch_prisms(int field, const int count, const bool friction) {
     const Mat axes = Model::field_orientation(field);
     const Vec point = (touch.on_prism + touch.on_axis - touch.normal * geom.radius) * 0.5f;
     const int cell = k >> 1, row = o.row + cell / o.columns, column = o.column + cell % o.columns;
-    add_contact(near && distance < Model::margin(pair), friction, pair, (row & 1) << 2 | (column & 1) << 1 | (k & 1),
+    add_contact(valid && distance < Model::margin(pair), friction, pair, (row & 1) << 2 | (column & 1) << 1 | (k & 1),
                 geom.center + axes * point, distance, axes * touch.normal);
   }
+}
+
+// Whether a geom may touch number k of the prisms below it, by the planes of its upper and its slanted face.
+INLINE bool reaches(int field, int pair, int k) const {
+  const Over o = over(field, pair);
+  float most;
+  const Prism p = prism(field, o, k, most);
+  const int slanted = k & 1 ? 4 : 2;
+  const float r = w.geoms[Model::second_geom(pair)].radius + Model::margin(pair) + 1e-6f;
+  return most >= o.center.z - o.reach.z && above(p, 0, o.half) <= r && above(p, slanted, o.half) <= r;
 }
 
 INLINE void collide_round_on_field(const bool friction) {
@@ -326,13 +328,7 @@ INLINE void collide_round_on_field(const bool friction) {
       if (next < all) {
         const Item item = dealt(before, all, next + lane);
         const int own = item.exists ? w.near_pairs[base + item.owner] : begin, k = item.exists ? item.number : 0;
-        bool near = item.exists;
-        if (listed > LANES || all > LANES) {  // else they are all looked at together
-          const Over o = over(field, own);
-          float most;
-          const Prism p = prism(field, o, k, most);
-          near = near && reaches(o, p, k, most, own);
-        }
+        const bool near = item.exists && reaches(field, own, k);
         const unsigned hits = ballot(near);
         if (near) w.near_ground[count + bits(hits & lanes_below())] = (unsigned)own << 16 | (unsigned)k;
         count += bits(hits);
