@@ -34,6 +34,7 @@ class Layout:
     touch: int
     candidates: int
     near_ground: int
+    near_pairs: int
     directions: int
     contact_rows: int
     frictional: int
@@ -68,9 +69,8 @@ class Layout:
         before = 32 * contacts + 12 * (self.frictional + 1)
         quads = self.stride // 4
         solving = 4 * max(16 * (quads | 1) + 8 + 12 * quads, self.limb_numbers, self.rows)
-        kinematics = 32 * self.dofs + 112 * self.links + 32 * (self.geoms + 1) + 2 * self.candidates
-        if self.near_ground:
-            kinematics += 4 * self.near_ground + 2 * (self.geoms + 1)
+        kinematics = 32 * self.dofs + 112 * self.links + 32 * (self.geoms + 1)
+        kinematics += 4 * self.near_ground + 2 * self.near_pairs + 2 * self.candidates
         total = 4 * vectors + pad(max(before, solving, 32 * self.links), 16)
         total = pad(total + 4 * self.jacobian_rows, 16)
         total += pad(max(kinematics, 4 * self.jacobian_rows * self.stride), 16)

@@ -173,7 +173,7 @@ struct alignas(16) World {
       Geom geoms[Model::GEOMS + 1];
 #if WITH_GROUND
       unsigned near_ground[Model::NEAR_GROUND];
-      unsigned short near_pairs[Model::GEOMS + 1];
+      unsigned short near_pairs[Model::NEAR_PAIRS];
 #endif
       unsigned short candidates[Model::CANDIDATES];
     };
