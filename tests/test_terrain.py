@@ -76,6 +76,37 @@ def test_harder_patches_are_harder(name):
     assert spread == [0.0] * 3 if name == "flat" else spread[0] < spread[1] < spread[2]
 
 
+@for_each("difficulty", (0.0, 0.5, 1.0))
+def test_stones_are_as_far_from_each_other_as_from_platform_and_edge(difficulty):
+    gap = 0.05 + 0.25 * difficulty
+    kinds = {"stones": lambda _, rng, size, cell: terrain.stepping_stones(difficulty, rng, size, cell)}
+    ground = terrain.Terrain(kinds, rows=1, columns=1, border=1.0)
+    x = np.arange(-4.0, 4.0, 0.001)
+    for y in (0.3, -3.4):
+        deep = ground.height(np.stack([x, np.full_like(x, y)], axis=-1)) < -0.5
+        ends = np.flatnonzero(np.diff(deep.astype(int)))
+        widths = 0.001 * np.diff(ends)[::2]
+        crossed = widths[widths < 2 * gap]  # else the line runs along a gap
+        np.testing.assert_allclose(crossed, gap, atol=2e-3)
+    assert ground.height([0.99, 0.99]) == 0.0
+
+
+def test_an_origin_is_over_all_that_is_near():
+    """However narrow it is."""
+
+    def spike(difficulty, rng, size, cell):
+        heights = np.zeros((round(size / cell) + 1,) * 2)
+        heights[len(heights) // 2, len(heights) // 2] = 0.4
+        return terrain.Patch(heights=heights)
+
+    def plank(difficulty, rng, size, cell):
+        return terrain.Patch(boxes=np.array([[0.03, 0.0, 0.1, 0.01, 0.3, 0.2]]))
+
+    for cell in (0.1, 0.25, 0.5, 1.0):
+        ground = terrain.Terrain({"spike": spike, "plank": plank}, rows=1, columns=2, cell=cell)
+        np.testing.assert_allclose(ground.origins[0, :, 2], [0.4, 0.3])
+
+
 def test_heights_are_those_of_rays_in_mujoco(ground):
     m = ground.under(MARBLE).compile()
     data = mujoco.MjData(m)
@@ -173,7 +204,7 @@ def test_a_kind_of_ones_own_may_be_as_low_as_one_says():
         ({"a": functools.partial(terrain.stairs, width=0.0)}, {}, "width of stairs must lie in"),
         ({"a": functools.partial(terrain.slope, platform=9.0)}, {}, "platform of a slope"),
         ({"a": functools.partial(terrain.obstacles, platform=9.0)}, {}, "free middle between obstacles"),
-        ({"a": terrain.stepping_stones}, {"size": 4.0}, "a stone, a gap and the edge"),
+        ({"a": terrain.stepping_stones}, {"size": 4.0}, "a stone, gaps and the edge"),
         ({"a": terrain.gap}, {"size": 2.0}, "platform and the gap around it"),
         ({"a": terrain.pit}, {"size": 2.0}, "floor of a pit"),
         (

@@ -87,11 +87,16 @@ def test_a_plane_is_ground_too_but_not_a_ceiling():
     torch.testing.assert_close(env.reset()["observation"], torch.tensor([[3.0] * len(GRID) + [0.0]]))
 
 
+LID = """<geom name="lid" type="hfield" hfield="f" euler="180 0 0"/></worldbody>
+<asset><hfield name="f" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>"""
+
+
 @for_each(
     ("more", "grid", "message"),
     [
         ('<geom type="box" size="1 1 1" euler="0 0 30"/>', GRID, "geom 1 is turned"),
         ('<geom name="ramp" type="plane" size="1 1 1" euler="0 9 0"/>', GRID, "geom 'ramp' is turned"),
+        (LID, GRID, "geom 'lid' is turned"),
         ("", GRID * np.nan, "grid must be finite"),
         ("", GRID[:, 0], r"grid must be points ahead and to the left, \(points, 2\), got \(15,\)"),
     ],

@@ -7,7 +7,7 @@ import torch
 from for_each import for_each
 from lane_contacts import find_contacts
 
-from torchrl_loco import LocoEnv, SimConfig
+from torchrl_loco import LocoEnv, SimConfig, Vary
 from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.compiled.collision.pairs import MOST_LISTED
 from torchrl_loco.sim.compiled.schedules.lanes import Description
@@ -287,3 +287,70 @@ def test_an_environment_says_that_its_solids_stand_on_spheres():
         found[engine] = env.rollout(20)["next", "observation"]
     assert (found["mujoco"][:, -1, 2] - 0.04).abs().max() < 2e-3
     torch.testing.assert_close(found["compiled"], found["mujoco"], atol=1e-4, rtol=0)
+
+
+def box_on_ground(how="spheres", randomize=(), pair=""):
+    """A box of 16 kg that lies on a field, and begins to slide at 1 m/s."""
+
+    class Slides(LocoEnv):
+        model = f"""<mujoco><asset><hfield name="c" nrow="2" ncol="2" size="3 3 1 1"/></asset><worldbody>
+          <geom name="ground" type="hfield" hfield="c"/>
+          <body pos="0 0 .1"><freejoint/><geom name="box" type="box" size=".2 .1 .1"/></body>
+        </worldbody><contact>{pair}</contact></mujoco>"""
+        config = SimConfig(ctrl_dt=0.02, sim_dt=0.002, solids_on_terrain=how, engine="mujoco")
+
+        def reward(self, s):
+            return s.qpos[:, 0]
+
+        def observation(self, s):
+            forces = s.contact_force("box"), s.contact_force(["box", "ground"])[:, 1]
+            return torch.cat([*forces, s.in_contact("box").float().unsqueeze(-1)], -1)
+
+        def begin(self, s):
+            return {"qpos": s.home, "qvel": torch.nn.functional.pad(torch.ones_like(s.qpos[:, :1]), (0, 5))}
+
+    Slides.randomize = list(randomize)
+    return Slides(1, "cpu", seed=0)
+
+
+def test_a_solid_has_the_contacts_of_its_spheres_and_they_its_friction():
+    weight = 9.81 * 16.0
+    smooth = [Vary("geom_friction", 0.05, 0.05 + 1e-6, of=name, how="set") for name in ("box", "ground")]
+    slid = {}
+    for how in ("exact", "spheres"):
+        for randomize in ((), smooth):
+            rollout = box_on_ground(how, randomize).rollout(80)
+            slid[how, bool(randomize)] = float(rollout["next", "reward"][0, -1])
+            if how == "spheres" and not randomize:
+                forces = rollout["next", "observation"][0, -1]
+                torch.testing.assert_close(forces[[2, 5, 6]], torch.tensor([weight, -weight, 1.0]), rtol=1e-3, atol=0)
+    for varied in (False, True):
+        assert slid["spheres", varied] == pytest.approx(slid["exact", varied], rel=0.05)
+    assert slid["spheres", True] > 8 * slid["spheres", False]
+    with pytest.raises(ValueError, match="the pair of ground and box would touch beside the spheres"):
+        box_on_ground(pair='<pair geom1="ground" geom2="box"/>')
+
+
+def test_ground_that_pairs_alone_let_touch():
+    geoms = '<geom contype="0" conaffinity="0" type="hfield" hfield="c" name="f"/>'
+    ball = '<body pos="0 0 .3"><freejoint/><geom contype="0" conaffinity="0" size=".1" name="b"/></body>'
+    pair = '<contact><pair geom1="f" geom2="b"/></contact>'
+
+    class Falls(LocoEnv):
+        model = f"""<mujoco>{OPTION}<asset><hfield name="c" nrow="2" ncol="2" size="3 3 1 1"/></asset>
+          <worldbody>{geoms}{ball}</worldbody>{pair}</mujoco>"""
+        config = SimConfig(ctrl_dt=0.02, sim_dt=0.002, episode_length=50)
+
+        def reward(self, s):
+            return s.terrain_height(s.qpos[:, :2])
+
+        def observation(self, s):
+            return s.qpos
+
+        def begin(self, s):
+            return {"qpos": s.home}
+
+    for engine in ("compiled", "mujoco"):
+        rollout = Falls(1, "cpu", seed=0, engine=engine).rollout(40)["next"]
+        assert rollout["observation"][0, -1, 2] == pytest.approx(0.1, abs=2e-3)
+        assert (rollout["reward"] == 0.0).all()

@@ -52,7 +52,8 @@ class Ground:
             is_level = (
                 own[2, 2] > 1 - 1e-9 if m.geom_type[g] == PLANE else np.isclose(own, np.round(own), atol=1e-6).all()
             )
-            if not is_level or (m.geom_type[g] == FIELD and data.geom_xmat[g, 0] < 0.5):
+            is_field = m.geom_type[g] == FIELD
+            if not is_level or (is_field and not np.isclose(data.geom_xmat[g], np.eye(3).ravel(), atol=1e-6).all()):
                 raise ValueError(f"heights of the ground: geom {m.geom(g).name or g!r} is turned")
         planes = [g for g in geoms if m.geom_type[g] == PLANE]
         fields = [Field.of(m, data, g, g) for g in geoms if m.geom_type[g] == FIELD]

@@ -10,6 +10,7 @@ import torch
 from torchrl_loco.envs import draws
 from torchrl_loco.envs.names import Elements
 from torchrl_loco.envs.vary import FIELDS, Vary
+from torchrl_loco.sim.corners import corners_of
 from torchrl_loco.sim.varied import Varied, why_not
 from torchrl_loco.sim.varied import field as array_of
 
@@ -29,7 +30,9 @@ class Change:
 
     def __init__(self, vary: Vary, elements: Elements, label: str) -> None:
         m, groups = elements.mj_model, vary.groups
-        per_element = [_places(vary.field, m, i) for i in _ids(vary, elements)]
+        ids, corners = _ids(vary, elements), corners_of(m) if FIELDS[vary.field].of == "geom" else {}
+        of_solids = {corner for solid in corners.keys() & set(ids) for corner in corners[solid]}
+        per_element = [_places(vary.field, m, i, corners.get(i, ())) for i in ids if i not in of_solids]
         self.vary, self.label = vary, label
         # Of each draw, the group of numbers of an element that it is for.
         self.group_of = list(range(len(groups))) * (1 if vary.shared else len(per_element))
@@ -92,15 +95,15 @@ def _gains(m: mujoco.MjModel, i: int) -> tuple[str, ...]:
     return ("kv",) if bias[1] == 0 and bias[2] == -gain else ()
 
 
-def _places(name: str, m: mujoco.MjModel, i: int) -> list[list[tuple[str, int, float]]]:
-    """Returns where each number of an element is: fields, indices of their flattened arrays, signs."""
+def _places(name: str, m: mujoco.MjModel, i: int, alike: Sequence[int] = ()) -> list[list[tuple[str, int, float]]]:
+    """Returns where each number of an element, and of those alike, is: fields, indices of flattened arrays, signs."""
     if name in ("kp", "kv"):
         gain, bias = ("actuator_gainprm", 10 * i, 1.0), ("actuator_biasprm", 10 * i + 1 + (name == "kv"), -1.0)
         return [[gain, bias] if _gains(m, i)[0] == name else [bias]]  # which the gain of the actuator is
     if name.startswith("dof_"):
         return [[(name, int(dof), 1.0) for dof in np.flatnonzero(m.dof_jntid == i)]]
     size = FIELDS[name].size
-    return [[(name, size * i + component, 1.0)] for component in range(size)]
+    return [[(name, size * each + component, 1.0) for each in (i, *alike)] for component in range(size)]
 
 
 class Variation:

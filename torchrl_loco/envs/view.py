@@ -20,6 +20,7 @@ from torchrl_loco.eyes.placing import bytes_placed
 from torchrl_loco.eyes.scene import for_rays
 from torchrl_loco.eyes.shapes import MISS
 from torchrl_loco.sim import models
+from torchrl_loco.sim.corners import corners_of
 from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.sim.varied import subtree_masses
 
@@ -60,6 +61,7 @@ class Catalog(Elements):
         self.scanning: dict[str, set[str]] = {}  # by hook, the names of those that it reads
         self.complete = False  # whether all that hooks ask for is known: what else they ask for later is refused
         self.sensor_address = {i: int(mj_model.sensor_adr[i]) for i in range(mj_model.nsensor)}  # in sensordata
+        self.corners = corners_of(mj_model)
         self.home = self._tensor(models.home_pose(mj_model))  # (nq,)
         self._index: dict[tuple[int, ...], torch.Tensor] = {}
         self.of_model: dict[Any, torch.Tensor] = {}  # numbers of the model that were asked for
@@ -512,7 +514,8 @@ class View:
     def contact_force(self, geoms: Names, *, history: bool = False) -> torch.Tensor:
         """Returns the net force of all contacts on each geom, world frame (N), of the last physics step.
 
-        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several. With ``history`` that of each physics step of
+        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several. A solid has those of the spheres that touch
+        the ground in its place (``solids_on_terrain="spheres"``). With ``history`` that of each physics step of
         the control step, in their order: ``(num_envs, substeps, 3)`` or ``(num_envs, substeps, count, 3)``. After a
         reset, all are those of the present state.
         """
@@ -526,9 +529,10 @@ class View:
         return self._of_contacts("in_contact", geoms, history) > 0
 
     def _of_contacts(self, name: str, geoms: Names, history: bool) -> torch.Tensor:
-        ids, one = self._catalog.ids("geom", geoms)
-        columns = self._catalog.contact_geoms
-        new = [geom for geom in ids if geom not in columns]
+        named, one = self._catalog.ids("geom", geoms)
+        parts = [[geom, *self._catalog.corners.get(geom, ())] for geom in named]
+        ids, columns = [geom for each in parts for geom in each], self._catalog.contact_geoms
+        new = [geom for geom in dict.fromkeys(ids) if geom not in columns]
         if new and self._catalog.complete:
             names = ", ".join(self._catalog.names("geom")[geom] for geom in new)
             raise ValueError(f"contacts of {names} were not asked for when the hooks were first called")
@@ -536,7 +540,10 @@ class View:
         values = self._array(f"{name}_history").transpose(1, 2) if history else self._array(name)
         if not self._catalog.complete:
             values = values[:, :1].expand(-1, len(columns), *values.shape[2:])
-        found = self._catalog.pick(values, [columns.index(geom) for geom in ids], one)
+        found = self._catalog.pick(values, [columns.index(geom) for geom in ids], one and len(ids) == 1)
+        if len(ids) > len(named):
+            sums = [part.sum(1) for part in found.split(list(map(len, parts)), dim=1)]
+            found = sums[0] if one else torch.stack(sums, dim=1)
         return found.transpose(1, 2) if history and not one else found
 
     # Random numbers.

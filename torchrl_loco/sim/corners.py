@@ -12,6 +12,7 @@ MOST_RADIUS, SHARE = 0.02, 0.5  # of a sphere: at most (m), and as a fraction of
 DIAGONALS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 LIKE = ("condim", "friction", "solref", "solimp", "solmix", "priority", "margin", "gap")
 """What a sphere has of its solid."""
+GROUP = 3  # of the spheres: not seen
 BITS = 31  # bits of a mask of contacts, but for its sign
 TYPE = mujoco.mjtGeom
 FIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
@@ -28,7 +29,8 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
         The names of the solids, or their numbers.
 
     Raises:
-        ValueError: the bits of contype and conaffinity do not suffice.
+        ValueError: the bits of contype and conaffinity do not suffice, or an explicit pair lets a solid touch the
+            ground as it is.
     """
     m = spec.compile()
     of_world = m.body_weldid[m.geom_bodyid] == 0
@@ -43,6 +45,13 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
     solids = [g for g in on_field if m.geom_type[g] in (ELLIPSOID, CYLINDER, BOX, MESH)]
     if not solids:
         return []
+    for pair in np.column_stack([m.pair_geom1, m.pair_geom2]):
+        if np.isin(pair, solids).any() and np.isin(pair, ground).any():
+            first, second = (m.geom(g).name or g for g in pair)
+            raise ValueError(
+                f"solids_on_terrain='spheres': the pair of {first} and {second} would touch beside the spheres of the "
+                "solid: leave it out, and set friction at the geoms"
+            )
     # Each kind of them has a bit of its own, which what may touch it accepts.
     kinds = sorted({(int(m.geom_contype[f]), int(m.geom_conaffinity[f])) for f in ground})
     used = int(np.bitwise_or.reduce(m.geom_contype | m.geom_conaffinity))
@@ -61,11 +70,23 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
                 continue
             names.append(geom.name or str(g))
             copied = {field: getattr(geom, field) for field in LIKE}
-            copied |= {"type": TYPE.mjGEOM_SPHERE, "contype": 0, "conaffinity": accepted, "mass": 0.0, "group": 3}
+            copied |= {"type": TYPE.mjGEOM_SPHERE, "contype": 0, "conaffinity": accepted, "mass": 0.0, "group": GROUP}
             for k, (center, radius) in enumerate(spheres(m, g)):
                 name = f"{geom.name}_corner_{k}" if geom.name else ""
                 geom.parent.add_geom(name=name, pos=center, size=[radius, 0, 0], **copied)
     return names
+
+
+def corners_of(m: mujoco.MjModel) -> dict[int, list[int]]:
+    """Returns the spheres that touch the ground in place of solids, by the solid's number."""
+    found: dict[int, list[int]] = {}
+    numbers = {m.geom(g).name: g for g in range(m.ngeom)}
+    for name, g in numbers.items():
+        solid = numbers.get(name.rpartition("_corner_")[0], -1) if "_corner_" in name else -1
+        is_own = solid >= 0 and m.geom_type[solid] in (ELLIPSOID, CYLINDER, BOX, MESH)
+        if is_own and m.geom_bodyid[g] == m.geom_bodyid[solid] and not m.geom_contype[g] and m.geom_group[g] == GROUP:
+            found.setdefault(solid, []).append(g)
+    return found
 
 
 def spheres(m: mujoco.MjModel, geom: int) -> list[tuple[np.ndarray, float]]:

@@ -116,7 +116,7 @@ class Terrain:
         if not isinstance(patch, Patch):
             raise TypeError(f"kind {name} must return a Patch, got {type(patch).__name__}")
         if patch.heights is not None:
-            heights = np.asarray(patch.heights, dtype=float)
+            heights: np.ndarray = np.ma.filled(np.ma.asarray(patch.heights, dtype=float), np.nan)
             if heights.shape != (side, side) or not np.isfinite(heights).all():
                 raise ValueError(f"heights of {name} must be {side} x {side} finite numbers, got {heights.shape}")
             patch = dataclasses.replace(patch, heights=heights)
@@ -141,10 +141,18 @@ class Terrain:
         return self.rows * self.size / 2, self.columns * self.size / 2
 
     def _origins(self) -> np.ndarray:
-        about = np.arange(-CLEAR, CLEAR + 1e-9, self.cell / 2)
+        count = int(CLEAR / (self.cell / 2) + 1e-9)  # so that points of the field are among them
+        about = np.unique([-CLEAR, *(self.cell / 2 * np.arange(-count, count + 1)), CLEAR])
         square = np.stack(np.meshgrid(about, about), axis=-1).reshape(-1, 2)
         centers = np.array([[self.center(row, column) for column in range(self.columns)] for row in range(self.rows)])
         highest = self.height(centers[:, :, None] + square).max(axis=-1)
+        for a, b, z, half_x, half_y, half_z in self.boxes:  # also those between these points
+            rows, columns = (
+                np.abs(middles - middle) < CLEAR + half
+                for middles, middle, half in ((centers[:, 0, 0], a, half_x), (centers[0, :, 1], b, half_y))
+            )
+            over = np.ix_(rows, columns)
+            highest[over] = np.maximum(highest[over], z + half_z)
         return np.concatenate([centers, highest[..., None]], axis=-1)
 
     def _border(self) -> np.ndarray:

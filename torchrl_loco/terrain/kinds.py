@@ -167,18 +167,24 @@ def stepping_stones(
 ) -> Patch:
     """Returns stones in a pit, around a platform: large ones close together to small ones apart.
 
-    Stones have a side of ``stone`` (m), are ``gap`` (m) apart, and differ by up to ``height`` (m) from the border's,
-    either way. ``platform`` is a side of the platform, ``depth`` that of the pit (m).
+    Stones have a side of ``stone`` (m), are ``gap`` (m) apart, as far from platform and edge, and differ by up to
+    ``height`` (m) from the border's, either way. ``platform`` is the least side of the platform, ``depth`` that of the
+    pit (m).
     """
     side, apart, uneven = (between(bounds, difficulty) for bounds in (stone, gap, height))
-    bottom = -depth - DEEP
-    check_room(platform + 2 * (side + apart + 0.25), size, "the platform, a stone, a gap and the edge on both sides")
-    boxes = ring(size / 2, 0.25, 0.0, bottom) + block(size / 2 - 0.25, -depth, bottom)
-    boxes += block(platform / 2, 0.0, bottom)
-    places = np.arange(-size / 2 + 0.25 + apart + side / 2, size / 2 - 0.25 - side / 2 - apart, side + apart)
+    bottom, pitch = -depth - DEEP, side + apart
+    count = int((size - 0.5 - apart) / pitch + 1e-9)  # of stones across; the edge takes what is left
+    within = math.ceil((platform + apart) / pitch - 1e-9)  # of them in whose place the platform is
+    within += (count - within) % 2
+    words = "the platform, a stone, gaps and the edge on both sides"
+    check_room((within + 2) * pitch + apart + 0.5, size, words)
+    edge = (size - count * pitch - apart) / 2
+    boxes = ring(size / 2, edge, 0.0, bottom) + block(size / 2 - edge, -depth, bottom)
+    boxes += block((within * pitch - apart) / 2, 0.0, bottom)
+    places = pitch * (np.arange(count) - (count - 1) / 2)
     for x in places:
         for y in places:
-            if max(abs(x), abs(y)) - side / 2 > platform / 2:
+            if max(abs(x), abs(y)) > within * pitch / 2:
                 top = rng.uniform(-uneven, uneven)
                 boxes.append([x, y, (top + bottom) / 2, side / 2, side / 2, (top - bottom) / 2])
     return Patch(boxes=np.array(boxes))

@@ -170,7 +170,8 @@ class Rough(Velocity):
     def cases(self) -> dict[str, int]:
         """Returns the patches by kind and difficulty, the hardest first."""
         kinds, rows = dict.fromkeys(self.ground.kinds), self.ground.difficulties[::-1]
-        return {f"{kind} at {row:.2f}": self.episode_length for row in rows for kind in kinds}
+        digits = max(2, math.ceil(math.log10(len(rows))))
+        return {f"{kind} at {row:.{digits}f}": self.episode_length for row in rows for kind in kinds}
 
     # What hooks share.
 

@@ -94,7 +94,8 @@ MOST_LISTED = 8  # boxes of the world up to which each has pairs of its own; mor
 
 def of_ground(m: mujoco.MjModel) -> np.ndarray:
     """Returns which geoms are fixed to the world and may be touched, ``(ngeom,)``."""
-    return (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0))
+    paired = np.isin(np.arange(m.ngeom), [*m.pair_geom1, *m.pair_geom2])
+    return (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype != 0) | (m.geom_conaffinity != 0) | paired)
 
 
 def looked_up(m: mujoco.MjModel) -> np.ndarray:
