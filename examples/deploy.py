@@ -66,10 +66,10 @@ if unknown := terms - robot.read(action, args.command).keys():
     parser.error(f"{args.file} observes {', '.join(sorted(unknown))}, which this program does not know")
 past = collections.deque(maxlen=facts["history"])  # of observations, the oldest first
 for step in range(round(args.seconds / facts["control_timestep"])):
+    seen = robot.read(action, args.command)
+    newest = np.concatenate([seen[term["term"]] for term in facts["observation"]])
+    past.extend([newest] * (past.maxlen if not past else 1))
     if step % facts["action_repeat"] == 0:
-        seen = robot.read(action, args.command)
-        newest = np.concatenate([seen[term["term"]] for term in facts["observation"]])
-        past.extend([newest] * (past.maxlen if not past else 1))
         observation = np.concatenate(past)
         action = session.run(["action"], {"observation": observation[None].astype(np.float32)})[0][0]
     robot.send(offset + scale * action)

@@ -112,7 +112,9 @@ def test_a_model_that_would_go_wrong_in_silence_is_refused():
         ({"actuator": MOTOR.replace("/>", ' ctrllimited="false"/>')}, "must be clipped"),
         ({"option": clampctrl}, "must be clipped"),
         ({"option": '<option actuatorgroupdisable="3"/>', "actuator": MOTOR.replace("/>", ' group="3"/>')}, "disabled"),
-        ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays"),
+        ({"actuator": MOTOR.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays of actuators"),
+        ({"sensor": VELOCITY.replace("/>", ' delay="0.1" nsample="4"/>')}, "delays and intervals of sensors"),
+        ({"sensor": VELOCITY.replace("/>", ' interval="0.1"/>')}, "delays and intervals of sensors"),
         ({"option": '<default><joint frictionloss="-1"/></default>'}, "frictionloss must not be negative"),
         ({"sensor": from_camera}, "sensor 'seen' is not evaluated"),
         ({"sensor": '<framepos name="place" objtype="body" objname="ant"/>'}, "sensor 'place' is not evaluated"),
@@ -158,11 +160,7 @@ def test_what_mujoco_warp_would_step_wrongly_from_reset_to_reset():
     joint = '<joint name="hinge" axis="0 1 0" stiffness="1" springyield="0.05"/>'
     body = f'<worldbody><body>{joint}<geom size="0.1" pos="0 0 0.2"/><site name="here"/></body></worldbody>'
     motor = '<actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator>'
-    sensor = '<sensor><gyro site="here" interval="0.05"/></sensor>'
-    for option, more, words in (
-        ('<flag sleep="enable"/>', "", "bodies that sleep"),
-        ("", sensor, "sensors with a delay or an interval"),
-    ):
+    for option, more, words in (('<flag sleep="enable"/>', "", "bodies that sleep"),):
         m = mujoco.MjModel.from_xml_string(f"<mujoco><option>{option}</option>{body}{motor}{more}</mujoco>")
         assert [what.startswith(words) for what in stepped_wrongly(m)] == [True]
         with pytest.raises(ValueError, match="plastic joints are not supported"):

@@ -251,6 +251,16 @@ def test_a_state_dict_of_another_environment_is_refused(shared):
             env.load_state_dict(state)
 
 
+def test_a_state_dict_with_numbers_of_other_elements_is_refused():
+    settings = {"num_envs": 2, "device": "cpu", "engine": "mujoco"}
+    one, other = (
+        torchrl_loco.make("walker_walk", randomize=[torchrl_loco.Vary("body_mass", 0.9, 1.1, of=of)], **settings)
+        for of in ("torso", "left_foot")
+    )
+    with pytest.raises(ValueError, match=r"the state has varied=\{'body_mass': \[1\]\}, this environment has"):
+        other.load_state_dict(one.state_dict())
+
+
 def test_a_lenient_state_dict_leaves_the_worlds_alone(shared):
     """EnvCreator loads its shadow environment's into every environment that it makes, whatever their size."""
     env = shared("walker_run", 3, seed=5)

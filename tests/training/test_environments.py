@@ -9,7 +9,8 @@ from torchrl.data import Bounded, Unbounded
 from torchrl.envs import FrameSkipTransform, StepCounter, Transform, TransformedEnv, UnsqueezeTransform
 
 import torchrl_loco
-from torchrl_loco.training import PPOConfig, Spaces, environments
+from torchrl_loco import LocoEnv, WalkerWalk
+from torchrl_loco.training import PPOConfig, Spaces, environments, preset
 from torchrl_loco.training.environments import ActionRepeat, Environments
 
 
@@ -137,6 +138,30 @@ class Named(torchrl_loco.WalkerStand):
 
     def observation(self, s):
         return {"observation": {"pose": s.qpos, "speed": s.qvel}}
+
+
+def test_evaluations_begin_alike_whatever_the_ones_before_have_left(tmp_path):
+    class Counts(LocoEnv):
+        body, model, config = "walker", WalkerWalk.model, WalkerWalk.config
+        shared = {"steps": torch.full((), 5.0)}
+        memory = {"episodes": ()}
+
+        def reward(self, s):
+            return s.steps + s.episodes
+
+        def adapt(self, s):
+            return {"steps": s.steps + 1.0}
+
+        def begin(self, s):
+            return {"episodes": s.episodes + 1.0}
+
+        def observation(self, s):
+            return s.qpos
+
+    environments = Environments(preset(Counts, "cpu", num_envs=2, num_steps=4, minibatch_size=8, out=tmp_path))
+    seen = [environments.evaluation(3, seed=4).rollout(6)["next", "reward"] for _ in range(2)]
+    assert torch.equal(*seen)
+    assert seen[0][0, 0] == 6.0  # of both once at the start
 
 
 def test_evaluations_return_what_an_environment_returns_that_was_handed_in():

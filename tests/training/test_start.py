@@ -17,11 +17,12 @@ from torch import nn
 from torchrl.envs import ObservationNorm, StepCounter, VecNormV2
 
 import torchrl_loco
-from torchrl_loco import cli, known_files, registry
+from torchrl_loco import Vary, cli, known_files, registry
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.environments import content_of
+from torchrl_loco.training.start import _settings_of
 
 QUICK = {**SMALL, "logger": ("csv",)}
 
@@ -142,7 +143,7 @@ def test_objects_are_handed_in_again_where_a_run_goes_on(tmp_path, capsys):
         train("walker_stand", network=elu, resume=plain)
 
 
-def test_an_environment_that_is_made_already(tmp_path):
+def test_an_environment_that_is_made_already(tmp_path, caplog):
     """Its worlds, protocol, settings and transforms are used, and it stays open."""
     base = torchrl_loco.make("walker_stand", 4, "cpu", seed=7, protocol="dm_control", episode_length=16, sim_dt=0.005)
     env = torchrl_loco.TransformedEnv(base, StepCounter())
@@ -164,6 +165,12 @@ def test_an_environment_that_is_made_already(tmp_path):
         evaluate_policy(run.load_policy("cpu"))
     with pytest.raises(ValueError, match="num_envs is that of the environment, 4"):
         train(env, algorithm="ppo", out=tmp_path, **{**settings, "num_envs": 8})
+    noisy = torchrl_loco.make("walker_stand", 4, "cpu", noise_scale=0.5, randomize=[Vary("body_mass", 0.9, 1.1)])
+    _settings_of(noisy, {})
+    assert "has a noise_scale and a randomize of its own" in caplog.text
+    for name, value in (("sim", {"ctrl_dt": 0.05}), ("randomize", False)):
+        with pytest.raises(ValueError, match=f"{name} is that of the environment"):
+            train(env, algorithm="ppo", out=tmp_path, **{**settings, name: value})
     with pytest.raises(ValueError, match="make the environment with num_envs=1 or more"):
         train(torchrl_loco.make("walker_stand", None, "cpu"), out=tmp_path)
 
@@ -180,6 +187,12 @@ def test_what_does_not_fit(tmp_path):
         with pytest.raises(ValueError, match=message):
             train(*args, **more)
     assert list(tmp_path.iterdir()) == []
+
+    class Gait(torchrl_loco.WalkerWalk):
+        options = {"gamma": (0.5, "how sharp")}
+
+    with pytest.raises(ValueError, match=r"Gait.options: 'gamma' is a setting of training, too: rename it"):
+        train(Gait, device="cpu", out=tmp_path, gamma=0.9)
 
 
 def test_a_class_that_cannot_be_made_leaves_no_folder(tmp_path):

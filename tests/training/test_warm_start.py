@@ -6,8 +6,10 @@ from compare import assert_same
 from for_each import for_each
 from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, small_walker, trained
+from torch import nn
 
 from torchrl_loco import Go1Velocity, cli
+from torchrl_loco.cli import policies
 from torchrl_loco.collector import rewritten_by
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import Trainer, preset, train
@@ -20,9 +22,11 @@ def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_
         first = trained(tmp_path / "first", algorithm)
         run = made(tmp_path / "second", algorithm, init=str(first.path))
         begun = Trainer(run).algorithm
-        assert_same(begun.networks.state_dict(), networks(first))
+        new = Trainer(made(tmp_path / "new", algorithm)).algorithm.networks.state_dict()
+        of_method = {name: value for name, value in new.items() if name.startswith("dual.")}  # which settings begin
+        assert_same(begun.networks.state_dict(), networks(first) | of_method)
         again = Trainer(made(tmp_path / "again", algorithm, init=str(first.checkpoint))).algorithm
-        assert_same(again.networks.state_dict(), networks(first))
+        assert_same(again.networks.state_dict(), networks(first) | of_method)
         assert "action" in rewritten_by(again.acting())  # which collectors need not zero
         with pytest.raises(ValueError, match=r"do not fit this run: hidden \(16,\), here \(8,\)$"):
             Trainer(made(tmp_path / "third", algorithm, init=str(first.path), hidden=(8,)))
@@ -38,6 +42,18 @@ def test_a_run_begins_with_the_weights_of_another_or_of_a_policy(algorithm, tmp_
             Trainer(made(tmp_path / "fifth", algorithm, init=str(first.policy), hidden=(8,)))
         with pytest.raises(FileNotFoundError):
             Trainer(made(tmp_path / "sixth", algorithm, init=str(tmp_path / "none.safetensors")))
+
+
+def test_layers_of_another_kind_are_refused(tmp_path):
+    """Their weights may fit."""
+    elu = lambda size, out: nn.Sequential(nn.Linear(size, 16), nn.ELU(), nn.Linear(16, out))  # noqa: E731
+    with small_walker():
+        own = train("walker_stand", device="cpu", algorithm="ppo", network=elu, out=tmp_path, **SMALL)
+        for init in (own.path, own.policy, own.checkpoint):
+            with pytest.raises(ValueError, match=r"has layers ObservationNorm, Linear, ELU, Linear, this run"):
+                Trainer(made(tmp_path / init.stem, init=str(init)))
+        with pytest.raises(ValueError, match=r"run with network of your own, which it does not hold: name .*policy"):
+            policies.Which().load(str(own.checkpoint), "cpu")
 
 
 def test_settings_of_the_simulation_are_those_of_the_run(tmp_path):

@@ -89,7 +89,11 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     named, too. The user may say the name of its task; else it is what the file says.
     """
     if source.suffix == ".pt" and is_run(source.parent):
-        return training.watching.last_policy(training.RunFolder(source.parent, task), device, source), source
+        run = training.RunFolder(source.parent, task)
+        if run.given:
+            own = " and ".join(run.given)
+            raise ValueError(f"{source} is of a run with {own} of your own, which it does not hold: name {run.policy}")
+        return training.watching.last_policy(run, device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         trained = policy.info["task"]

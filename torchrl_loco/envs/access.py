@@ -303,7 +303,7 @@ class WorldAccess(Task, EnvBase):
                 ``{"memory": {"level": [3.0]}}``: rows are dealt to the worlds in turn.
 
         Raises:
-            ValueError: the task has no such entry, or it has another shape.
+            ValueError: the task has no such entry, it has another shape, or a number is not finite.
         """
         known = {"shared": self.world.shared, "memory": self.world.memory}
         for group, entries in stage.items():
@@ -315,6 +315,8 @@ class WorldAccess(Task, EnvBase):
                 given = torch.as_tensor(values, device=self.device)
                 given = torch.atleast_1d(given) if group == "memory" else given
                 new = given.to(target.dtype)
+                if not new.isfinite().all():
+                    raise ValueError(f"{group} {name!r} of a stage must be finite, got {values}")
                 if not target.is_floating_point() and (new != given).any():
                     raise ValueError(f"{group} {name!r} of a stage must be numbers of {target.dtype}, got {values}")
                 if group == "memory" and len(new):
@@ -368,11 +370,13 @@ class WorldAccess(Task, EnvBase):
         """Restores a ``state_dict``: the worlds, their random streams and the seed.
 
         Raises:
-            ValueError: it was taken from an environment of another body, protocol, batch size or world offset.
+            ValueError: it was taken from an environment of another body, protocol, batch size or world offset, or in
+                which other numbers of the model vary.
         """
         for name, value in self._identity().items():
-            if state.get(name) != value:
-                raise ValueError(f"the state has {name}={state.get(name)!r}, this environment has {value!r}")
+            given = state.get(name, value if name == "varied" else None)  # of which older states say nothing
+            if given != value:
+                raise ValueError(f"the state has {name}={given!r}, this environment has {value!r}")
         worlds = State(state["worlds"], batch_size=self.batch_size, device=self.device)
         self._reset(worlds, set_state=True, finite=False)  # a world that is to be reset may be not finite
         self._continue_with(state["seed"])
@@ -391,6 +395,8 @@ class WorldAccess(Task, EnvBase):
         same |= {"protocol": self.protocol, "world_offset": self.world_offset or 0}
         if cases := self.cases():  # the memory of another set of motions points elsewhere
             same["cases"] = dict(cases)
+        if self.variation is not None:  # a number is that of an element, which its place tells
+            same["varied"] = {name: list(map(int, places)) for name, places in self.variation.varied.places.items()}
         return same
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, **kwargs: Any) -> Any:

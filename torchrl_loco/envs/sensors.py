@@ -95,8 +95,6 @@ AXES = {int(Sensor.mjSENS_FRAMEXAXIS): 0, int(Sensor.mjSENS_FRAMEYAXIS): 1, int(
 def evaluate(s: Any, sensor: int) -> torch.Tensor | None:
     """Returns a sensor that is a function of pose and velocity, ``(num_envs, size)``; ``None`` for any other."""
     m = s._catalog.mj_model
-    if m.sensor_interval[sensor].any() or m.sensor_delay[sensor]:
-        return None
     values = _evaluate(s, int(m.sensor_type[sensor]), sensor)
     cutoff = float(m.sensor_cutoff[sensor])
     return values.clamp(-cutoff, cutoff) if values is not None and cutoff > 0 else values

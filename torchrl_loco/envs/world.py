@@ -100,6 +100,7 @@ class World:
             self.metrics = metrics.view(n, -1)
             self.done, self.terminated, self.truncated = map(Buffer.around, flags.view(3, n))
             self.memory, self.shared = hooks.catalog.zeros()
+            self._starts = hooks.catalog.starts
             self.mask, self.non_finite, self.ended, self.cut_off = (Buffer(n, bool, device) for _ in range(4))
             self.episode, self.elapsed_steps = (Buffer(n, int, device) for _ in range(2))
             self.stream, self.seed = (Buffer(count, wp.uint32, device) for count in (n, 1))
@@ -116,10 +117,7 @@ class World:
                 self._make_funcs(task)
             self._make_parts(task)
             wp.synchronize_device(device)  # made on Warp's stream, used on torch's
-            for rows in (*self.memory.values(), *self.shared.values()):
-                rows.zero_()  # recording wrote into it
-            for name, start in hooks.catalog.starts.items():
-                self.shared[name].copy_(start)
+            self.forget()  # recording wrote into it
             self.sim.numbers.copy_(nominal)
             self.set_seed(task.seed)  # recording ran resets, which advanced the episodes
             for monitor in self._monitors:
@@ -463,6 +461,13 @@ class World:
             self.mask.torch.fill_(True)
         else:
             self.mask.torch.copy_(mask)
+
+    def forget(self) -> None:
+        """Lets memory, and what worlds share, be those of a new environment."""
+        for rows in (*self.memory.values(), *self.shared.values()):
+            rows.zero_()
+        for name, start in self._starts.items():
+            self.shared[name].copy_(start)
 
     def set_seed(self, seed: int) -> None:
         """Restarts all random streams at episode 0."""

@@ -172,6 +172,8 @@ def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjMo
         wrong.append("actions beyond [-1, 1] must be clipped: leave ctrllimited and the flag clampctrl on")
     if mj_model.actuator_delay.any():
         wrong.append("delays of actuators are not supported: they are not part of the state that is reset")
+    if mj_model.sensor_delay.any() or mj_model.sensor_interval.any():
+        wrong.append("delays and intervals of sensors are not supported: they are not part of the state that is reset")
     if mj_model.nplastic:
         wrong.append("plastic joints are not supported: their deformation is not part of the state that is reset")
     losses = mj_model.dof_frictionloss, mj_model.tendon_frictionloss

@@ -96,7 +96,10 @@ class FlatAdam:
         for number, state in self.state_dict()["state"].items():
             loaded = states.get(number, {})
             for name in ("exp_avg", "exp_avg_sq"):
-                state[name].copy_(loaded[name]) if name in loaded else state[name].zero_()
+                moments = loaded.get(name, torch.zeros_like(state[name]))
+                if moments.shape != state[name].shape:
+                    raise ValueError(f"a state of {tuple(moments.shape)} for a parameter of {tuple(state[name].shape)}")
+                state[name].copy_(moments)
         step = max((float(loaded["step"]) for loaded in states.values() if "step" in loaded), default=0.0)
         for vectors in self._vectors:
             vectors.restart(step)

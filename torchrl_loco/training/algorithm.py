@@ -360,6 +360,7 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
         networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
+        of_settings = {k: v.clone() for k, v in algorithm.networks.state_dict().items() if k.startswith("dual.")}
         try:
             algorithm.load_networks(networks)
         except (RuntimeError, KeyError) as error:
@@ -368,11 +369,24 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
             differing = [f"{name} {old}, here {new}" for name, (old, new) in pairs.items() if old != new]
             why = ", ".join(differing) or str(error).splitlines()[-1].strip()
             raise ValueError(f"init: the networks of {source} do not fit this run: {why}") from error
+        algorithm.networks.load_state_dict(of_settings, strict=False)
+        if run.policy.is_file():  # weights do not tell what lies between them
+            for mine in map(layers_of_actor, algorithm.actors):
+                _check_kinds(source, mine, layers_of(run.load_policy(device).module))
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
     for mine in map(layers_of_actor, algorithm.actors):
-        for own, other in zip(mine, layers_of(policy.module), strict=False):
+        theirs = layers_of(policy.module)
+        _check_kinds(source, mine, theirs)
+        for own, other in zip(mine, theirs, strict=False):
             _copy(own, other, source, last=own is mine[-1])
+
+
+def _check_kinds(source: Path, mine: list[nn.Module], theirs: list[nn.Module]) -> None:
+    """Checks that layers are of the same kinds; behind an actor's last a policy may have a tanh and its bound."""
+    kinds = [", ".join(type(layer).__name__ for layer in layers) for layers in (theirs[: len(mine)], mine)]
+    if kinds[0] != kinds[1]:
+        raise ValueError(f"init: the policy of {source} has layers {kinds[0]}, this run {kinds[1]}")
 
 
 def _check_strides(source: Path, theirs: tuple[int, ...], own: tuple[int, ...]) -> None:
@@ -389,7 +403,7 @@ def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None
     for name, values in theirs.items():
         fits = name in mine and mine[name].shape[1:] == values.shape[1:]
         rows = len(values) if values.ndim else 1
-        if type(own) is not type(other) or not fits or (values.ndim and len(mine[name]) not in (rows, 2 * rows * last)):
+        if not fits or (values.ndim and len(mine[name]) not in (rows, 2 * rows * last)):
             shapes = [tuple(each[name].shape) if name in each else None for each in (theirs, mine)]
             raise ValueError(f"init: the policy of {source} has {name} of shape {shapes[0]}, this run {shapes[1]}")
         if values.ndim:

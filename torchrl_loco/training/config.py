@@ -529,6 +529,9 @@ def preset(
     own: Mapping[str, Mapping[str, Any]] = {}
     if on_cuda or task not in tasks.found():  # importing one of ours takes seconds
         cls = resolve(task)
+        of_training = {field.name for each in CONFIGS.values() for field in dataclasses.fields(each)}
+        if taken := sorted(of_training.intersection(cls.options)):
+            raise ValueError(f"{cls.__name__}.options: {taken[0]!r} is a setting of training, too: rename it")
         where = f"in the presets of {cls.__name__}"
         for name, settings in cls.presets.items():
             of = CONFIGS[check_choice(f"algorithm {where}", name, CONFIGS)]

@@ -152,8 +152,9 @@ class Environments:
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] | None = None) -> EnvBase:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
-        They are made once for a number of episodes; then their random streams begin anew. They have the settings and
-        the transforms of the environment that was handed in. With transforms there are as many worlds as there,
+        They are made once for a number of episodes; then their random streams, memory and what they share begin anew.
+        They have the settings and the transforms of the environment that was handed in. With transforms there are as
+        many worlds as there,
         whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at the stage of the curriculum
         that the information of a policy tells.
         """
@@ -164,6 +165,7 @@ class Environments:
                 _warn_of_other_attributes(unwrapped(self._given)[0], self._evaluating[worlds])
         own = self._evaluating[worlds]
         own.set_seed(seed)
+        own.world.forget()
         own.set_stage(own.stage_of(info or {}))
         env: EnvBase = own
         for transform in self.transforms:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import logging
 import shutil
 import sys
 from collections.abc import Callable
@@ -119,6 +120,17 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
         own["sim"] = sim
     if type(base).randomize and not base.randomize:
         own["randomize"] = False
+    lost = [name for name, plain in (("noise_scale", 1.0), ("play", False)) if getattr(base, name) != plain]
+    lost += ["randomize"] if base.randomize and list(base.randomize) != list(type(base).randomize) else []
+    if lost:
+        logging.getLogger("torchrl_loco").warning(
+            "the environment has a %s of its own, which its run's folder does not hold: eval, play and record of the "
+            "policy do without",
+            " and a ".join(lost),
+        )
+    for name in ("sim", "randomize"):
+        if name in settings and name not in own and settings[name] not in ({}, None, True):
+            raise ValueError(f"{name} is that of the environment: leave it out, got {settings[name]!r}")
     seen = base.pixels if "pixels" in env.observation_spec.keys() else None  # noqa: SIM118, else no network sees them
     if not seen and (needless := [name for name in ("from_pixels", *OF_PIXELS) if settings.get(name)]):
         raise ValueError(
