@@ -160,7 +160,11 @@ def test_what_mujoco_warp_would_step_wrongly_from_reset_to_reset():
     joint = '<joint name="hinge" axis="0 1 0" stiffness="1" springyield="0.05"/>'
     body = f'<worldbody><body>{joint}<geom size="0.1" pos="0 0 0.2"/><site name="here"/></body></worldbody>'
     motor = '<actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator>'
-    for option, more, words in (('<flag sleep="enable"/>', "", "bodies that sleep"),):
+    sensor = '<sensor><gyro site="here" interval="0.05"/></sensor>'
+    for option, more, words in (
+        ('<flag sleep="enable"/>', "", "bodies that sleep"),
+        ("", sensor, "sensors with a delay or an interval"),
+    ):
         m = mujoco.MjModel.from_xml_string(f"<mujoco><option>{option}</option>{body}{motor}{more}</mujoco>")
         assert [what.startswith(words) for what in stepped_wrongly(m)] == [True]
         with pytest.raises(ValueError, match="plastic joints are not supported"):

@@ -257,7 +257,7 @@ def test_a_state_dict_with_numbers_of_other_elements_is_refused():
         torchrl_loco.make("walker_walk", randomize=[torchrl_loco.Vary("body_mass", 0.9, 1.1, of=of)], **settings)
         for of in ("torso", "left_foot")
     )
-    with pytest.raises(ValueError, match=r"the state has varied=\{'body_mass': \[1\]\}, this environment has"):
+    with pytest.raises(ValueError, match="the state has numbers of other elements that vary, of body_mass"):
         other.load_state_dict(one.state_dict())
 
 

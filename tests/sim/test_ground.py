@@ -12,7 +12,7 @@ from torchrl_loco.sim import Simulation
 from torchrl_loco.sim.compiled.collision.pairs import MOST_LISTED
 from torchrl_loco.sim.compiled.schedules.lanes import Description
 from torchrl_loco.sim.compiled.support import unsupported
-from torchrl_loco.sim.corners import stand_on_corners
+from torchrl_loco.sim.corners import corners_of, stand_on_corners
 from torchrl_loco.sim.warp_init import init_warp
 
 BODY = '<body pos="0 0 {z}"><freejoint/><geom {geom}/></body>'
@@ -238,6 +238,7 @@ def test_solids_touch_fields_by_spheres_in_their_corners():
     assert len(stand_on_corners(spec)) == len(SOLIDS)
     m = spec.compile()
     assert unsupported(m) == []
+    assert sorted(map(len, corners_of(m).values())) == [6, 6, 8, 8]  # also of solids without names
     np.testing.assert_allclose(m.body_inertia, before.body_inertia)
     np.testing.assert_allclose(m.body_mass, before.body_mass)
     data = mujoco.MjData(m)

@@ -124,7 +124,7 @@ def test_evaluations_are_behind_the_transforms_of_an_environment_that_was_handed
     other = environments.evaluation(2, seed=7)
     assert (other.num_envs, other.seed, other.protocol, other.config.sim_dt) == (3, 7, "dm_control", 0.025)
     assert "step_count" in other.reset().keys()  # noqa: SIM118
-    assert environments.names_of_transforms == ["StepCounter", "Counted"]
+    assert environments.own["transforms"] == ["StepCounter", "Counted"]
     other.rollout(3)
     assert env.transform.steps.tolist() == [3, 3, 3]
     assert env.base_env.base_env is base

@@ -22,7 +22,8 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.environments import content_of
-from torchrl_loco.training.start import _settings_of
+from torchrl_loco.training.start import _warn_of_what_is_not_kept
+from torchrl_loco.training.watching import last_policy
 
 QUICK = {**SMALL, "logger": ("csv",)}
 
@@ -161,16 +162,19 @@ def test_an_environment_that_is_made_already(tmp_path, caplog):
     metrics = run.read_metrics()
     assert metrics["episodes"][-1] == 4 * 64 // 16  # of worlds that begin together, the first counts too
     assert set(metrics["episode_length"][1:]) == {16.0}
-    with pytest.raises(ValueError, match="was trained behind StepCounter, ObservationNorm"):
-        evaluate_policy(run.load_policy("cpu"))
+    for policy in (run.load_policy("cpu"), last_policy(run, "cpu")):
+        with pytest.raises(ValueError, match="was trained behind StepCounter, ObservationNorm"):
+            evaluate_policy(policy)
     with pytest.raises(ValueError, match="num_envs is that of the environment, 4"):
         train(env, algorithm="ppo", out=tmp_path, **{**settings, "num_envs": 8})
     noisy = torchrl_loco.make("walker_stand", 4, "cpu", noise_scale=0.5, randomize=[Vary("body_mass", 0.9, 1.1)])
-    _settings_of(noisy, {})
+    _warn_of_what_is_not_kept(noisy)
     assert "has a noise_scale and a randomize of its own" in caplog.text
-    for name, value in (("sim", {"ctrl_dt": 0.05}), ("randomize", False)):
-        with pytest.raises(ValueError, match=f"{name} is that of the environment"):
-            train(env, algorithm="ppo", out=tmp_path, **{**settings, name: value})
+    with pytest.raises(ValueError, match=r"sim is that of the environment, with sim_dt=0\.005"):
+        train(env, algorithm="ppo", out=tmp_path, **{**settings, "sim": {"sim_dt": 0.01}})
+    other = preset("walker_stand", "cpu", "ppo", out=tmp_path, sim={"sim_dt": 0.01}, **QUICK)
+    again = train(env, other, total_frames=64, randomize=False, sim={"sim_dt": 0.005})
+    assert again.load_config().of_env == {"sim_dt": 0.005}
     with pytest.raises(ValueError, match="make the environment with num_envs=1 or more"):
         train(torchrl_loco.make("walker_stand", None, "cpu"), out=tmp_path)
 

@@ -90,9 +90,9 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     """
     if source.suffix == ".pt" and is_run(source.parent):
         run = training.RunFolder(source.parent, task)
-        if run.given:
-            own = " and ".join(run.given)
-            raise ValueError(f"{source} is of a run with {own} of your own, which it does not hold: name {run.policy}")
+        if own := [name for name in run.given if name != "env"]:
+            what = " and ".join(own)
+            raise ValueError(f"{source} is of a run with {what} of your own, which it does not hold: name {run.policy}")
         return training.watching.last_policy(run, device, source), source
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)

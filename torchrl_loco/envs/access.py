@@ -303,7 +303,7 @@ class WorldAccess(Task, EnvBase):
                 ``{"memory": {"level": [3.0]}}``: rows are dealt to the worlds in turn.
 
         Raises:
-            ValueError: the task has no such entry, it has another shape, or a number is not finite.
+            ValueError: the task has no such entry, or it has another shape.
         """
         known = {"shared": self.world.shared, "memory": self.world.memory}
         for group, entries in stage.items():
@@ -315,8 +315,6 @@ class WorldAccess(Task, EnvBase):
                 given = torch.as_tensor(values, device=self.device)
                 given = torch.atleast_1d(given) if group == "memory" else given
                 new = given.to(target.dtype)
-                if not new.isfinite().all():
-                    raise ValueError(f"{group} {name!r} of a stage must be finite, got {values}")
                 if not target.is_floating_point() and (new != given).any():
                     raise ValueError(f"{group} {name!r} of a stage must be numbers of {target.dtype}, got {values}")
                 if group == "memory" and len(new):
@@ -374,7 +372,10 @@ class WorldAccess(Task, EnvBase):
                 which other numbers of the model vary.
         """
         for name, value in self._identity().items():
-            given = state.get(name, value if name == "varied" else None)  # of which older states say nothing
+            given: Any = state.get(name, value if name == "varied" else None)  # of which older states say nothing
+            if name == "varied" and given != value:
+                fields = ", ".join(sorted(key for key in {*given, *value} if given.get(key) != value.get(key)))
+                raise ValueError(f"the state has numbers of other elements that vary, of {fields}")
             if given != value:
                 raise ValueError(f"the state has {name}={given!r}, this environment has {value!r}")
         worlds = State(state["worlds"], batch_size=self.batch_size, device=self.device)

@@ -514,10 +514,11 @@ class View:
     def contact_force(self, geoms: Names, *, history: bool = False) -> torch.Tensor:
         """Returns the net force of all contacts on each geom, world frame (N), of the last physics step.
 
-        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several. A solid has those of the spheres that touch
-        the ground in its place (``solids_on_terrain="spheres"``). With ``history`` that of each physics step of
-        the control step, in their order: ``(num_envs, substeps, 3)`` or ``(num_envs, substeps, count, 3)``. After a
-        reset, all are those of the present state.
+        Shape ``(num_envs, 3)``, or ``(num_envs, count, 3)`` for several. A solid has those of the spheres that
+        touch the ground in its place (``solids_on_terrain="spheres"``), which have names too,
+        ``<solid>_corner_0`` ... With ``history`` that of each physics step of the control step, in their order:
+        ``(num_envs, substeps, 3)`` or ``(num_envs, substeps, count, 3)``. After a reset, all are those of the
+        present state.
         """
         return self._of_contacts("contact_force", geoms, history)
 

@@ -68,23 +68,26 @@ def stand_on_corners(spec: mujoco.MjSpec) -> list[str]:
             if g not in solids:
                 geom.conaffinity |= accepted
                 continue
-            names.append(geom.name or str(g))
+            geom.name = geom.name or f"solid_{g}"  # by which its spheres are known
+            names.append(geom.name)
             copied = {field: getattr(geom, field) for field in LIKE}
             copied |= {"type": TYPE.mjGEOM_SPHERE, "contype": 0, "conaffinity": accepted, "mass": 0.0, "group": GROUP}
             for k, (center, radius) in enumerate(spheres(m, g)):
-                name = f"{geom.name}_corner_{k}" if geom.name else ""
-                geom.parent.add_geom(name=name, pos=center, size=[radius, 0, 0], **copied)
+                geom.parent.add_geom(name=f"{geom.name}_corner_{k}", pos=center, size=[radius, 0, 0], **copied)
     return names
 
 
 def corners_of(m: mujoco.MjModel) -> dict[int, list[int]]:
     """Returns the spheres that touch the ground in place of solids, by the solid's number."""
     found: dict[int, list[int]] = {}
+    if not (m.geom_type == FIELD).any():
+        return found
     numbers = {m.geom(g).name: g for g in range(m.ngeom)}
     for name, g in numbers.items():
         solid = numbers.get(name.rpartition("_corner_")[0], -1) if "_corner_" in name else -1
         is_own = solid >= 0 and m.geom_type[solid] in (ELLIPSOID, CYLINDER, BOX, MESH)
-        if is_own and m.geom_bodyid[g] == m.geom_bodyid[solid] and not m.geom_contype[g] and m.geom_group[g] == GROUP:
+        is_own = is_own and m.geom_bodyid[g] == m.geom_bodyid[solid] and m.geom_type[g] == int(TYPE.mjGEOM_SPHERE)
+        if is_own and not m.geom_contype[g] and m.geom_group[g] == GROUP:
             found.setdefault(solid, []).append(g)
     return found
 

@@ -259,6 +259,7 @@ def stepped_wrongly(m: mujoco.MjModel) -> list[str]:
     exact = (m.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_FILTEREXACT)).any()
     found = {
         "bodies that sleep (<flag sleep>)": m.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP),
+        "sensors with a delay or an interval": m.sensor_delay.any() or m.sensor_interval.any(),
         "filterexact activations by RK4": exact and m.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4),
     }
     return [what for what, is_there in found.items() if is_there]

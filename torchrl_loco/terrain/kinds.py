@@ -175,7 +175,7 @@ def stepping_stones(
     bottom, pitch = -depth - DEEP, side + apart
     count = int((size - 0.5 - apart) / pitch + 1e-9)  # of stones across; the edge takes what is left
     within = math.ceil((platform + apart) / pitch - 1e-9)  # of them in whose place the platform is
-    within += (count - within) % 2
+    count -= (count - within) % 2
     words = "the platform, a stone, gaps and the edge on both sides"
     check_room((within + 2) * pitch + apart + 0.5, size, words)
     edge = (size - count * pitch - apart) / 2

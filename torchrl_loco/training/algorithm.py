@@ -360,6 +360,10 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
         networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
+        if "network" in run.given and run.policy.is_file():  # weights do not tell what lies between them
+            theirs = layers_of(Policy.load(run.policy, device).module)
+            for mine in map(layers_of_actor, algorithm.actors):
+                _check_kinds(source, mine, theirs)
         of_settings = {k: v.clone() for k, v in algorithm.networks.state_dict().items() if k.startswith("dual.")}
         try:
             algorithm.load_networks(networks)
@@ -370,9 +374,6 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
             why = ", ".join(differing) or str(error).splitlines()[-1].strip()
             raise ValueError(f"init: the networks of {source} do not fit this run: {why}") from error
         algorithm.networks.load_state_dict(of_settings, strict=False)
-        if run.policy.is_file():  # weights do not tell what lies between them
-            for mine in map(layers_of_actor, algorithm.actors):
-                _check_kinds(source, mine, layers_of(run.load_policy(device).module))
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
     for mine in map(layers_of_actor, algorithm.actors):

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize, smooth_l1_loss
 from torchrl_loco.envs.rotations import matrix, product, small_turn
 from torchrl_loco.envs.sensors import into_frame, out_of_frame
 from torchrl_loco.policy import ObservationNorm, moments
+from torchrl_loco.sim.compiled.collision.pairs import of_ground
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import normed_layers
 
@@ -124,6 +125,5 @@ def unpredictable(m: mujoco.MjModel) -> str:
         return "a mocap body is moved by hand"
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
-    ground = (m.body_weldid[m.geom_bodyid] == 0) & ((m.geom_contype | m.geom_conaffinity) != 0)
     level = (m.geom_type == int(plane)) & (data.geom_xmat[:, 8] > 1.0 - 1e-9)
-    return "the ground must be a level plane" if (ground & ~level).any() else ""
+    return "the ground must be a level plane" if (of_ground(m) & ~level).any() else ""

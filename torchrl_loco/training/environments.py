@@ -120,9 +120,12 @@ class Environments:
         return self._task.config.episode_length if length is None else length
 
     @property
-    def names_of_transforms(self) -> list[str]:
-        """Names of the transforms' classes."""
-        return [] if self._given is None else [type(one).__name__ for one in named_transforms(self._given).values()]
+    def own(self) -> dict[str, Any]:
+        """What a policy must be told of them: the length of episodes if it is another, the transforms' classes."""
+        own: dict[str, Any] = {} if self.full_length == self.length_of_task else {"full_length": self.full_length}
+        if self._given is not None and self.transforms:
+            own["transforms"] = [type(one).__name__ for one in named_transforms(self._given).values()]
+        return own
 
     def training(self, nan_dump: Path) -> EnvBase:
         """Returns the environment in which the run trains: actions are held for ``action_repeat`` frames.
@@ -153,9 +156,9 @@ class Environments:
         """Returns worlds in which a policy of the run can be played, each for an episode of the task's own length.
 
         They are made once for a number of episodes; then their random streams, memory and what they share begin anew.
-        They have the settings and the transforms of the environment that was handed in. With transforms there are as
-        many worlds as there,
-        whatever ``episodes`` is: some transforms keep a row for each. Episodes begin at the stage of the curriculum
+        They have the settings and the transforms of the environment that was handed in. With transforms there
+        are as many worlds as there, whatever ``episodes`` is: some transforms keep a row for each. Episodes
+        begin at the stage of the curriculum
         that the information of a policy tells.
         """
         worlds = self._config.num_envs if self.transforms else episodes

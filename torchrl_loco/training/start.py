@@ -87,6 +87,7 @@ def train(
         return run_to_end(run, given, **changes)
     if given.env is not None:
         chosen |= _settings_of(given.env, {**settings, **chosen})
+        _warn_of_what_is_not_kept(unwrapped(given.env)[0])
     config = _config(cls, config, algorithm, {**settings, **chosen})
     return run_to_end(config, given)
 
@@ -116,21 +117,8 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
     own |= {"options": base.options_given} if base.options_given else {}
     as_made = sim_config(type(base).config, base.protocol, base.num_envs, {})
     names = {field.name for field in dataclasses.fields(Sim)} - {"naconmax"}  # which is for the number of its worlds
-    if sim := {name: new for name in sorted(names) if (new := getattr(base.config, name)) != getattr(as_made, name)}:
-        own["sim"] = sim
-    if type(base).randomize and not base.randomize:
-        own["randomize"] = False
-    lost = [name for name, plain in (("noise_scale", 1.0), ("play", False)) if getattr(base, name) != plain]
-    lost += ["randomize"] if base.randomize and list(base.randomize) != list(type(base).randomize) else []
-    if lost:
-        logging.getLogger("torchrl_loco").warning(
-            "the environment has a %s of its own, which its run's folder does not hold: eval, play and record of the "
-            "policy do without",
-            " and a ".join(lost),
-        )
-    for name in ("sim", "randomize"):
-        if name in settings and name not in own and settings[name] not in ({}, None, True):
-            raise ValueError(f"{name} is that of the environment: leave it out, got {settings[name]!r}")
+    own["sim"] = {name: new for name in sorted(names) if (new := getattr(base.config, name)) != getattr(as_made, name)}
+    own["randomize"] = bool(base.randomize or not type(base).randomize)
     seen = base.pixels if "pixels" in env.observation_spec.keys() else None  # noqa: SIM118, else no network sees them
     if not seen and (needless := [name for name in ("from_pixels", *OF_PIXELS) if settings.get(name)]):
         raise ValueError(
@@ -138,10 +126,27 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
             "transforms out that take them away"
         )
     own |= {"from_pixels": True, **seen.settings(base.mj_model)} if seen else {"from_pixels": False}
+    given = {name: value for name, value in settings.items() if name != "randomize" or type(base).randomize}
+    fields = given.pop("sim", {})
+    fields = dataclasses.asdict(fields) if isinstance(fields, Sim) else fields
+    if wrong := [name for name, value in fields.items() if value not in (None, getattr(base.config, name, value))]:
+        has = f"{wrong[0]}={getattr(base.config, wrong[0])!r}"
+        raise ValueError(f"sim is that of the environment, with {has}: leave it out")
     for name, value in own.items():
-        if name in settings and str(settings[name]) != str(value):
+        if name in given and str(given[name]) != str(value):
             raise ValueError(f"{name} is that of the environment, {value!r}: leave it out, got {settings[name]!r}")
     return {**own, "seed": settings.get("seed", base.seed), "action_repeat": settings.get("action_repeat", 1)}
+
+
+def _warn_of_what_is_not_kept(env: LocoEnv) -> None:
+    lost = [name for name, plain in (("noise_scale", 1.0), ("play", False)) if getattr(env, name) != plain]
+    lost += ["randomize"] if env.randomize and list(env.randomize) != list(type(env).randomize) else []
+    if lost and distributed.is_first():
+        logging.getLogger("torchrl_loco").warning(
+            "the environment has a %s of its own, which its run's folder does not hold: eval, play and record of the "
+            "policy do without",
+            " and a ".join(lost),
+        )
 
 
 def _check_same(run: RunFolder, env: EnvBase) -> None:

@@ -385,11 +385,9 @@ class Trainer:
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if stage := self._base.stage_of({"stage": self._base.get_stage()}):
             of_env["stage"] = stage
-        if self.environments.full_length != self.environments.length_of_task:
-            of_env["full_length"] = self.environments.full_length
-        if self.environments.transforms:
-            of_env["transforms"] = self.environments.names_of_transforms
-        elif terms := self._base.observation_layout.get(self.algorithm.spaces.actor_key):
+        of_env |= self.environments.own
+        terms = self._base.observation_layout.get(self.algorithm.spaces.actor_key)
+        if terms and not self.environments.transforms:
             of_env["terms"] = list(terms.items())
         policy = deterministic_policy(self.algorithm.actor, self.config, {**when, **of_env})
         self._compare_at(stage)
@@ -469,6 +467,7 @@ class Trainer:
                 "transforms_of_best": self._transforms_of_best,
                 "stage": self._base.get_stage(),
                 "terms": list(self._terms),
+                **self.environments.own,
             }
             self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]}, self.config.keep)
         distributed.wait_for_all()

@@ -55,5 +55,6 @@ def last_policy(run: RunFolder, device: str | None = None, path: Path | None = N
     spaces = Spaces.of(make(resolve(run.task), 1, device)) if stored is None else Spaces(**stored)
     algorithm = ALGORITHMS[config.algorithm](config, spaces)
     algorithm.load_networks(checkpoint["algorithm"]["networks"])
-    counters: dict[str, Any] = {name: checkpoint[name] for name in ("frames", "seconds", "stage") if name in checkpoint}
+    names = "frames", "seconds", "stage", "full_length", "transforms"
+    counters: dict[str, Any] = {name: checkpoint[name] for name in names if name in checkpoint}
     return deterministic_policy(algorithm.actor, config, counters)

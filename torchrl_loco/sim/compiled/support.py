@@ -202,7 +202,10 @@ def _sensors(m: mujoco.MjModel) -> list[str]:
     names = [
         m.sensor(i).name
         for i in range(m.nsensor)
-        if not _is_sensed(m, m.sensor_type[i], m.sensor_objid[i], at_sites) or m.sensor_cutoff[i]
+        if not _is_sensed(m, m.sensor_type[i], m.sensor_objid[i], at_sites)
+        or m.sensor_cutoff[i]
+        or m.sensor_interval[i].any()
+        or m.sensor_delay[i]
     ]
     what = (
         "anything but touch; velocimeter, gyro, accelerometer, force and torque of what moves (the last two where "
