@@ -325,7 +325,7 @@ def test_the_most_derived_definition_wins_hook_by_hook():
 
 @pytest.mark.parametrize(
     ("way", "backend"),
-    [("kernel", None), ("torch.compile", "eager"), pytest.param("torch.compile", "inductor", marks=pytest.mark.ci)],
+    [("kernel", None), ("torch.compile", "aot_eager"), pytest.param("torch.compile", "inductor", marks=pytest.mark.ci)],
 )
 def test_compiled_hooks_do_the_same(actions, monkeypatch, way, backend):
     """With the same random numbers, up to rounding; torch.compile takes over on CUDA where there can be no kernel."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 import warp as wp
-from torch.fx._lazy_graph_module import _LazyGraphModule
 
 import torchrl_loco
 from torchrl_loco.envs.fusion import CannotFuse, ReachedError, fuse, trace
@@ -171,8 +170,9 @@ class Part:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # those of torch's own code
-                _LazyGraphModule.force_recompile(traced)  # writes its Python, which torch.compile cannot call for
-                compiled = torch.compile(traced, fullgraph=True, dynamic=False)
+                # Not the lazy module itself, whose Python torch.compile cannot call for.
+                module = torch.fx.GraphModule(traced, traced.graph)
+                compiled = torch.compile(module, fullgraph=True, dynamic=False)
                 compiled(*self._arrays.values())
             self._compare(lambda: compiled(*self._arrays.values()), COMPILED)
         except Exception as error:  # whatever the compiler raises

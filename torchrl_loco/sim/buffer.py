@@ -35,8 +35,9 @@ class PackedBuffers:
     """
 
     def __init__(self, floats: Sequence[int], flags: int, device: torch.device) -> None:
-        self._floats, self._end = list(floats), 4 * sum(floats)
-        self.memory = torch.zeros(self._end + flags, dtype=torch.uint8, device=device)
+        self._floats, self._end, self._flags = list(floats), 4 * sum(floats), flags
+        size = -(-(self._end + flags) // 4) * 4  # whole numbers, as torch.compile takes it for memory of floats
+        self.memory = torch.zeros(size, dtype=torch.uint8, device=device)
 
     def parts(self, memory: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Returns the arrays, then the flags, in :attr:`memory` or in a copy of it; all of one dimension.
@@ -44,4 +45,4 @@ class PackedBuffers:
         To autograd each is a tensor of its own: a reward that is scaled in place leaves the observation as it was.
         """
         floats = memory[: self._end].view(torch.float32).split(self._floats)
-        return *(part.data for part in floats), memory[self._end :].view(torch.bool).data
+        return *(part.data for part in floats), memory[self._end : self._end + self._flags].view(torch.bool).data
