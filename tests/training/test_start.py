@@ -170,8 +170,9 @@ def test_an_environment_that_is_made_already(tmp_path, caplog):
     noisy = torchrl_loco.make("walker_stand", 4, "cpu", noise_scale=0.5, randomize=[Vary("body_mass", 0.9, 1.1)])
     _warn_of_what_is_not_kept(noisy)
     assert "has a noise_scale and a randomize of its own" in caplog.text
-    with pytest.raises(ValueError, match=r"sim is that of the environment, with sim_dt=0\.005"):
-        train(env, algorithm="ppo", out=tmp_path, **{**settings, "sim": {"sim_dt": 0.01}})
+    for sim, message in (({"sim_dt": 0.01}, r"with sim_dt=0\.005"), ({"iteration": 7}, "did you mean 'iterations'")):
+        with pytest.raises(ValueError, match=message):
+            train(env, algorithm="ppo", out=tmp_path, **{**settings, "sim": sim})
     other = preset("walker_stand", "cpu", "ppo", out=tmp_path, sim={"sim_dt": 0.01}, **QUICK)
     again = train(env, other, total_frames=64, randomize=False, sim={"sim_dt": 0.005})
     assert again.load_config().of_env == {"sim_dt": 0.005}

@@ -47,6 +47,16 @@ Sim.__doc__ = "Fields of :class:`torchrl_loco.SimConfig` that a run replaces; ``
 AS_THE_TASK = Sim()
 
 
+def checked_sim(sim: Any) -> Sim:
+    """Returns settings of the simulation, or a dict of some of them, as all of them."""
+    if isinstance(sim, Sim):
+        return sim
+    if not isinstance(sim, Mapping):
+        raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {sim!r}")
+    names = [field.name for field in dataclasses.fields(Sim)]
+    return Sim(**{check_choice("field of sim", name, names): value for name, value in sim.items()})
+
+
 class Options(dict[str, Any]):
     """Values of a task's own options by name, as JSON can hold them. They do not change."""
 
@@ -185,12 +195,7 @@ class TrainingConfig:
                 raise ValueError(f"{field} must name the {what} of at least one layer")
             object.__setattr__(self, field, tuple(check_int(f"each {what} of {field}", each) for each in several))
         object.__setattr__(self, "size", checked_size(self.size))
-        if not isinstance(self.sim, Sim):
-            if not isinstance(self.sim, Mapping):
-                raise TypeError(f"sim must be a dict of fields of torchrl_loco.SimConfig, got {self.sim!r}")
-            names = [field.name for field in dataclasses.fields(Sim)]
-            chosen = {check_choice("field of sim", name, names): value for name, value in self.sim.items()}
-            object.__setattr__(self, "sim", Sim(**chosen))
+        object.__setattr__(self, "sim", checked_sim(self.sim))
         object.__setattr__(self, "options", Options(self.options))
         object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
         if not self.from_pixels:

@@ -17,7 +17,16 @@ from torchrl_loco.registry import check_is_run, is_place, task_name
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
-from torchrl_loco.training.config import CONFIGS, OF_PIXELS, Sim, TrainingConfig, check_setting, preset, tuning_note
+from torchrl_loco.training.config import (
+    CONFIGS,
+    OF_PIXELS,
+    Sim,
+    TrainingConfig,
+    check_setting,
+    checked_sim,
+    preset,
+    tuning_note,
+)
 from torchrl_loco.training.environments import Given, unwrapped
 from torchrl_loco.training.run_folder import RunFolder
 from torchrl_loco.training.trainer import NothingToLearnError, Trainer
@@ -127,9 +136,8 @@ def _settings_of(env: EnvBase, settings: dict[str, Any]) -> dict[str, Any]:
         )
     own |= {"from_pixels": True, **seen.settings(base.mj_model)} if seen else {"from_pixels": False}
     given = {name: value for name, value in settings.items() if name != "randomize" or type(base).randomize}
-    fields = given.pop("sim", {})
-    fields = dataclasses.asdict(fields) if isinstance(fields, Sim) else fields
-    if wrong := [name for name, value in fields.items() if value not in (None, getattr(base.config, name, value))]:
+    asked = sim_of({"sim": dataclasses.asdict(checked_sim(given.pop("sim", {})))})
+    if wrong := [name for name, value in asked.items() if value != getattr(base.config, name)]:
         has = f"{wrong[0]}={getattr(base.config, wrong[0])!r}"
         raise ValueError(f"sim is that of the environment, with {has}: leave it out")
     for name, value in own.items():
