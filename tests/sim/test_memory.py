@@ -3,6 +3,7 @@
 import dataclasses
 import types
 
+import mujoco
 import pytest
 import torch
 import warp as wp
@@ -10,7 +11,7 @@ from cases import CONFIGS, MODELS
 from for_each import for_each
 
 import torchrl_loco
-from torchrl_loco.config import sim_config
+from torchrl_loco.config import SimConfig, sim_config
 from torchrl_loco.sim import Simulation, compiled, models, mujoco_warp, simulation
 from torchrl_loco.sim.compiled import step
 from torchrl_loco.sim.engine import Setup
@@ -67,6 +68,17 @@ def test_too_many_worlds_are_refused_before_they_are_allocated(engine, monkeypat
         monkeypatch.setattr(simulation, "free_memory", lambda device, free=107 * num_envs: free)
         with pytest.raises(MemoryError, match=rf"num_envs={num_envs} needs about \d+\.\d GiB on cpu.* \d+ worlds fit"):
             torchrl_loco.make("walker_walk", num_envs, "cpu", engine=engine)
+
+
+def test_ground_that_does_not_fit_is_refused_before_it_is_allocated(monkeypatch):
+    """A field of 4 MB under a ball, where 3 are free."""
+    field = '<asset><hfield name="f" nrow="2000" ncol="500" size="1 1 1 1"/></asset>'
+    ball = '<geom type="hfield" hfield="f"/><body pos="0 0 3"><freejoint/><geom size=".1"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{field}<worldbody>{ball}</worldbody></mujoco>")
+    monkeypatch.setattr(simulation.ENGINES["compiled"], "__init__", None)
+    monkeypatch.setattr(simulation, "free_memory", lambda device: 3e6)
+    with pytest.raises(MemoryError, match="free: about 0 worlds fit"):
+        simulation.Simulation(model, SimConfig(ctrl_dt=0.02, sim_dt=0.002), 2, torch.device("cpu"))
 
 
 def test_more_worlds_than_warp_can_address_are_refused():

@@ -142,7 +142,8 @@ class Simulation:
         init_warp()
         self.device = wp.get_device(str(device))
         setup = Setup(mj_model, config, num_envs, self.device, geoms, differing, rows)
-        check_memory(ENGINES[name].memory(setup), num_envs, device)
+        of_all = compiled.ground_bytes(mj_model) if name == "compiled" else 0
+        check_memory(ENGINES[name].memory(setup) + of_all, num_envs, device, of_all)
         self.engine = ENGINES[name](setup)
         self.model, self.data = self.engine.model, self.engine.data
         self._every = wp.ones(num_envs, dtype=bool, device=self.device)
@@ -349,8 +350,12 @@ def choose_engine(mj_model: mujoco.MjModel, config: SimConfig, varied: Varied | 
     return "mujoco_warp", f"engine 'compiled' does not have: {'; '.join(missing)}"
 
 
-def check_memory(needed: int, num_envs: int, device: torch.device) -> None:
-    """Raises MemoryError, with the figures and how many worlds would fit, if more memory is needed than is free."""
+def check_memory(needed: int, num_envs: int, device: torch.device, of_all: int = 0) -> None:
+    """Checks that memory is free (bytes), of which ``of_all`` does not depend on the number of worlds.
+
+    Raises:
+        MemoryError: more is needed; the message has the figures, and how many worlds would fit.
+    """
     free = free_memory(device)
     if needed > free and device.type == "cuda":  # closed environments may have left memory to torch and Warp
         gc.collect()
@@ -360,7 +365,7 @@ def check_memory(needed: int, num_envs: int, device: torch.device) -> None:
     if needed > free:
         raise MemoryError(
             f"num_envs={num_envs} needs about {needed / 2**30:.1f} GiB on {device}, which has {free / 2**30:.1f} GiB "
-            f"free: about {int(num_envs * free / needed)} worlds fit"
+            f"free: about {int(num_envs * max(free - of_all, 0) / (needed - of_all))} worlds fit"
         )
 
 

@@ -8,6 +8,7 @@ tables. What comes out is C++ for the CPU and for CUDA; ``source(model, substeps
 """
 
 from torchrl_loco.sim.compiled.engine import CompiledEngine as CompiledEngine
+from torchrl_loco.sim.compiled.engine import ground_bytes as ground_bytes
 from torchrl_loco.sim.compiled.schedules import lanes as lanes
 from torchrl_loco.sim.compiled.step import source as source
 from torchrl_loco.sim.compiled.support import unsupported as unsupported

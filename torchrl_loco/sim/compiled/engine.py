@@ -13,9 +13,9 @@ from typing_extensions import override
 
 from torchrl_loco.sim import mjw
 from torchrl_loco.sim.compiled import step
-from torchrl_loco.sim.compiled.collision.ground import Ground
+from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS, Ground
 from torchrl_loco.sim.compiled.collision.kinds import FIELD
-from torchrl_loco.sim.compiled.collision.pairs import stand_ins
+from torchrl_loco.sim.compiled.collision.pairs import looked_up, stand_ins
 from torchrl_loco.sim.compiled.ir.parameters import VariedModel
 from torchrl_loco.sim.compiled.read_only import ReadOnly, read_only
 from torchrl_loco.sim.compiled.schedules.shared import Asked
@@ -238,6 +238,11 @@ def arrays_of(data: Data, terrain: wp.array, numbers: wp.array) -> Any:
     """Returns what a step reads and writes, as its kernel takes it."""
     outputs = {f"{name}_out": array for name, array in data.outputs().items()}
     return fill(Arrays, terrain_in=terrain, ctrl_in=data.ctrl, numbers_out=numbers, **outputs)
+
+
+def ground_bytes(m: mujoco.MjModel) -> int:
+    """Returns about how much memory the ground takes that is looked up, which lies once on the device (bytes)."""
+    return 4 * (m.nhfielddata + BOX_NUMBERS * int(looked_up(m).sum()))
 
 
 def _check_forces(m: mujoco.MjModel, contact_geoms: Sequence[int]) -> None:
