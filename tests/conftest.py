@@ -4,6 +4,7 @@ os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")  # trio's, which is imported
 if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads than one each would slow them down
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import contextlib
 import gc
 import tempfile
 import types
@@ -31,9 +32,10 @@ def pytest_collectstart():
 
 def pytest_collection_finish():
     """Lets Python search for garbage again, but rarely, and not among what was imported, which takes it a second."""
-    import imageio.plugins.pyav
+    with contextlib.suppress(ModuleNotFoundError):  # on a machine that has a GPU and no videos
+        import imageio.plugins.pyav
 
-    imageio.plugins.pyav.gc = types.SimpleNamespace(collect=lambda: None)  # after each video
+        imageio.plugins.pyav.gc = types.SimpleNamespace(collect=lambda: None)  # after each video
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
     gc.enable()

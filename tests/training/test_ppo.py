@@ -19,6 +19,7 @@ from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.algorithm import clip_and_step
 from torchrl_loco.training.ppo import PPO
+from torchrl_loco.training.rows import are_linear_and_silu
 
 
 def made(spaces=WALKER, **overrides):
@@ -170,7 +171,7 @@ def test_gradients_are_those_of_clip_ppo_loss(bounded):
     data = TensorDict({**rows, **targets, "action": action, "log_prob": log_prob}, batch_size=[128])
     ppo.optimizer.clipped_step = lambda norm: torch.zeros(())
     torch.manual_seed(1)
-    metrics = dict(zip(ppo.metric_names, ppo.gradient_step(data), strict=True))
+    metrics = metrics_of(ppo, data)
     (vectors,) = ppo.optimizer._vectors
     ours = vectors.gradient().clone()
     ppo.optimizer.zero_grad()
@@ -198,7 +199,8 @@ def test_updates_raise_what_is_rewarded():
 
 def metrics_of(ppo, data):
     """Returns what a gradient step says before it is made."""
-    return dict(zip(ppo.metric_names, ppo.gradient_step(data), strict=True))
+    (minibatch,) = ppo.minibatches(data.clone())
+    return dict(zip(ppo.metric_names, ppo.gradient_step(minibatch), strict=True))
 
 
 def test_advantages_are_normalised():
@@ -435,3 +437,43 @@ def test_what_is_computed_beside_is_the_same():
     assert all(torch.equal(*pair) for pair in zip(parameters[True, True], parameters[True, False], strict=True))
     for ours, exact in zip(parameters[True, True], parameters[False, False], strict=True):
         torch.testing.assert_close(ours, exact, rtol=0.1, atol=0.01)
+
+
+def test_which_networks_triton_computes():
+    """Linear layers with SiLU between them, each with a weight and a bias of its own, which get slopes of their own."""
+    one, other, silu = nn.Linear(8, 8), nn.Linear(8, 8), nn.SiLU()
+    tied = nn.Linear(8, 8)
+    tied.weight, tied.bias = one.weight, one.bias
+    expected = {
+        (one, silu, other): True,
+        (one, silu, other, silu, nn.Linear(8, 1)): True,
+        (one,): True,
+        (one, nn.ReLU(), other): False,
+        (one, silu): False,
+        (nn.Linear(8, 8, bias=False), silu, other): False,
+        (one, silu, tied): False,
+        (one, silu, one): False,
+        (one, silu, nn.LayerNorm(8), other): False,
+    }
+    for layers, fits in expected.items():
+        parameters = list(nn.Sequential(*layers).parameters())
+        assert are_linear_and_silu(layers, parameters) == fits, layers
+
+
+def test_gradients_in_parts_are_summed_and_forgotten():
+    """A step adds them to what autograd gives; none goes into a second step."""
+    weight = nn.Parameter(torch.ones(3))
+    optimizer = FlatAdam([weight], lr=torch.tensor(0.1))
+    ((whole, length),) = [(vectors.whole, len(vectors.whole)) for vectors in optimizer._vectors]
+    parts = optimizer.parts(4)
+    assert parts.shape == (4, length)
+    with torch.no_grad():
+        parts[1, :3], parts[3, :3] = 1.0, 2.0
+    (weight * torch.tensor([1.0, 0.0, -3.0])).sum().backward()
+    torch.testing.assert_close(optimizer.clipped_step(math.inf), torch.tensor([4.0, 3.0, 0.0]).norm())
+    torch.testing.assert_close(weight.detach(), torch.tensor([0.9, 0.9, 1.0]), rtol=0, atol=1e-4)
+    optimizer.zero_grad()
+    assert optimizer.clipped_step(math.inf) == 0.0
+    assert optimizer.parts(4) is parts
+    assert optimizer.clipped_step(math.inf) > 0.0
+    assert whole.grad is None

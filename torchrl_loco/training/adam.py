@@ -1,5 +1,6 @@
 """Adam on clipped gradients in one kernel: parameters and moments lie in one vector each."""
 
+import functools
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -7,13 +8,17 @@ import torch
 import warp as wp
 from torch import Tensor, nn
 
+from torchrl_loco.sim.compilation import compile_kernels
 from torchrl_loco.sim.graph import EXCLUSIVE, current_stream
 from torchrl_loco.sim.warp_init import init_warp
 from torchrl_loco.training import distributed
 
-ALIGNED = 8
+ALIGNED = 16
 """Numbers at a multiple of which each parameter and each row of a matrix begins: products of matrices in bfloat16 read
-16 bytes at a time."""
+16 bytes at a time, which Triton does where it sees multiples of 16."""
+
+SMALL, LARGE = 64, 256
+"""Threads of a block: few, so that all multiprocessors have some of a thread for each step or world, and many."""
 
 
 class FlatAdam:
@@ -50,13 +55,31 @@ class FlatAdam:
         self._vectors = [Vectors(group["params"], group["betas"]) for group in self.param_groups]
 
     def wide(self, dtype: torch.dtype) -> dict[nn.Parameter, Tensor]:
-        """Returns all parameters in another type, each row with zeros up to a multiple of 8.
+        """Returns all parameters in another type, each row with zeros up to a multiple of ``ALIGNED``.
 
         Gradients flow from them into the vectors at once, instead of parameter by parameter; none into those that do
         not require them.
         """
         self.adopt()
         return {part: view for vectors in self._vectors for part, view in vectors.wide(dtype)}
+
+    def parts(self, count: int) -> Tensor:
+        """Returns memory of shape ``(count, n)`` for parts of the gradient of the first group's vector, of length n.
+
+        Whoever asks for it writes the same places each time. The next step adds the sum of the parts to what autograd
+        gives, unless the gradients are forgotten before.
+        """
+        return self._vectors[0].in_parts(count)
+
+    def compile_with(self, kernels: Iterable[tuple[wp.Kernel, int]]) -> None:
+        """Compiles its kernel and others, each with the threads of a block, at once."""
+        out = self._vectors[0].whole
+        launches = [  # which do not look at what they are given
+            functools.partial(launch, kernel, 1, [0] * (len(kernel.adj.args) - 1), [out], block_dim)
+            for kernel, block_dim in ((step_of_adam, LARGE), *kernels)
+        ]
+        init_warp()
+        compile_kernels(launches, wp.device_from_torch(out.device))
 
     def adopt(self) -> None:
         """Takes parameters back that were moved out of the vectors, as by ``module.to`` or a second optimizer."""
@@ -79,7 +102,7 @@ class FlatAdam:
             vectors.count()
             tensors = gradient, norm.view(1), group["lr"].view(1), vectors.counts
             settings = [max_norm, *group["betas"], group["eps"]]
-            launch(step_of_adam, len(gradient), [*tensors, *settings], [vectors.whole, *vectors.moments])
+            launch(step_of_adam, len(gradient), [*tensors, *settings], [vectors.whole, *vectors.moments], LARGE)
         return norm
 
     def state_dict(self) -> dict[str, Any]:
@@ -129,6 +152,8 @@ class Vectors:
         self.counts = torch.tensor([0.0, 1.0, 1.0], **doubles)
         self._factors, self._summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
         self._addresses: list[int] = []
+        self._memory: dict[int, Tensor] = {}
+        self._in_use: list[Tensor] = []
         self.adopt()
 
     @torch.no_grad()
@@ -174,14 +199,25 @@ class Vectors:
 
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
-        gradient = torch.zeros_like(self.whole) if self.whole.grad is None else self.whole.grad
+        given = [parts.detach().sum(0) for parts in self._in_use]
+        given += [] if self.whole.grad is None else [self.whole.grad]
+        gradient = functools.reduce(torch.add, given) if given else torch.zeros_like(self.whole)
         own = [(part.grad, view) for part, view in zip(self._parts, self._views(gradient), strict=True)]
         found = [(of_part, view) for of_part, view in own if of_part is not None]
-        torch._foreach_add_([view for _, view in found], [of_part for of_part, _ in found])
+        if found:
+            torch._foreach_add_([view for _, view in found], [of_part for of_part, _ in found])
         return gradient
+
+    def in_parts(self, count: int) -> Tensor:
+        """Returns memory for parts of the gradient, of which it takes the sum."""
+        if count not in self._memory:
+            self._memory[count] = self.whole.new_zeros(count, len(self.whole), requires_grad=True)
+        self._in_use = [self._memory[count]]
+        return self._memory[count]
 
     def forget_gradients(self) -> None:
         """Forgets them."""
+        self._in_use = []
         for part in (self.whole, *self._parts):
             part.grad = None
 
@@ -214,7 +250,13 @@ def step_of_adam(
     parameter[i] = parameter[i] - lr[0] / of_first * first[i] / (wp.sqrt(second[i] / of_second) + eps)
 
 
-def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+def launch(
+    kernel: wp.Kernel,
+    dim: int | tuple[int, ...],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    block_dim: int = SMALL,
+) -> None:
     """Launches a kernel of ``dim`` threads on torch's current stream, or adds it to what torch records.
 
     It reads ``inputs``, numbers and tensors on one device, and writes the tensors ``outputs``.
@@ -223,4 +265,4 @@ def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any],
     device = wp.device_from_torch(outputs[0].device)
     arrays = [[wp.from_torch(x.detach()) if isinstance(x, torch.Tensor) else x for x in xs] for xs in (inputs, outputs)]
     with EXCLUSIVE, wp.ScopedStream(current_stream(device), sync_enter=False):
-        wp.launch(kernel, dim, *arrays, device=device)
+        wp.launch(kernel, dim, *arrays, device=device, block_dim=block_dim)

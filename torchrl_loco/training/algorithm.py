@@ -25,7 +25,7 @@ from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
 WARMUP = 1  # epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles
-ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps begins
+ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps begins; rows at one of twice that
 
 
 class Algorithm(ABC):
@@ -78,11 +78,15 @@ class Algorithm(ABC):
         """Makes a gradient step without transfers between host and device, so that CUDA can record it.
 
         Args:
-            minibatch: steps that :meth:`prepare` returned, batch ``(minibatch_size,)``.
+            minibatch: steps that :meth:`minibatches` returned, batch ``(minibatch_size,)``.
 
         Returns:
             The metrics, a scalar each, in the order of ``metric_names``.
         """
+
+    def minibatches(self, steps: TensorDictBase) -> Iterable[TensorDictBase]:
+        """Returns the minibatches of an epoch's shuffled ``steps``, a copy, which it may change."""
+        return steps.split(self.config.minibatch_size)
 
     def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
         """Returns metrics of what :meth:`prepare` made of a batch, shape ``(len(batch_metric_names),)``, on all ranks.
@@ -128,6 +132,11 @@ class Algorithm(ABC):
         config = self.config
         self.adopt()
         self.schedule(progress)
+        with self.beside():
+            frames = batch.numel()
+            orders = [
+                torch.randperm(frames, generator=self.generator, device=self.device) for _ in range(config.epochs)
+            ]
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
             of_batch = self.batch_metrics(data)
@@ -138,8 +147,8 @@ class Algorithm(ABC):
             else:
                 self._data.steps.update_(data)
         self._totals.zero_()
-        for _ in range(config.epochs):
-            order = torch.randperm(len(data), generator=self.generator, device=self.device)
+        self.join()
+        for order in orders:
             self._order.copy_(order[: len(self._order)])
             self._epoch()
         self.learn_moments(batch)  # after the update: the losses need the normalisation used while collecting
@@ -176,14 +185,14 @@ class Algorithm(ABC):
         if self._stream is None:
             yield
         else:
-            self._stream.wait_stream(torch.cuda.current_stream())
+            self._stream.wait_stream(torch.cuda.current_stream(self.device))
             with torch.cuda.stream(self._stream):
                 yield
 
     def join(self) -> None:
         """Waits for what was put on the other stream, without the host."""
         if self._stream is not None:
-            torch.cuda.current_stream().wait_stream(self._stream)
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)
 
     def adopt(self) -> None:
         """Takes parameters back that were moved out of the vectors of their optimizers."""
@@ -217,7 +226,7 @@ class Algorithm(ABC):
     def _gradient_steps(self) -> None:
         """Does what is recorded on CUDA: an epoch, by itself."""
         assert self._data is not None
-        for minibatch in self._data[self._order].split(self.config.minibatch_size):
+        for minibatch in self.minibatches(self._data[self._order]):
             self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
 
     def release(self) -> None:
@@ -334,6 +343,7 @@ class Packed:
             size = entry[0].numel() * entry.element_size()
             self._entries.append((key, slice(end, end + size), entry.dtype, entry.shape[1:]))
             end += -(-size // ROW_ALIGNED) * ROW_ALIGNED
+        end += end % (2 * ROW_ALIGNED)
         self._rows = entry.new_zeros(len(steps), end, dtype=torch.uint8)
         self.steps = self._views(self._rows).update_(steps)
 

@@ -1,6 +1,5 @@
 """Proximal policy optimization (Schulman et al., 2017)."""
 
-import contextlib
 import functools
 import math
 from collections.abc import Iterable, Mapping
@@ -11,20 +10,19 @@ import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
-from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.policy import ObservationNorm, layers_of
+from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
-from torchrl_loco.training.adam import ALIGNED, launch
+from torchrl_loco.training.adam import ALIGNED, LARGE, SMALL, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
 from torchrl_loco.training.config import PPOConfig
+from torchrl_loco.training.rows import Rows, triton_kernels
 
-LR_RANGE = (1e-5, 1e-2)  # of a learning rate that follows the divergence
-
+LOWEST_LR, HIGHEST_LR = wp.constant(1e-5), wp.constant(1e-2)  # of a learning rate that follows the divergence
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 LOG_2 = wp.constant(math.log(2.0))
 CRITIC_COEFF = 0.5
@@ -66,14 +64,22 @@ class PPO(Algorithm):
         whole = nn.Sequential(of_critic, value)
         self.critic = ValueOperator(whole, in_keys=[spaces.critic_key]).to(config.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
-        self._mean, self._value = Rows(mean, first), Rows(value, of_critic)
         self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
+        self._mean, self._value = Rows(mean, first, self._dtype), Rows(value, of_critic, self._dtype)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = self.make_optimizer("actor and critic", parameters)
+        self._compile()
         self._written = ("action", "action_log_prob", *("before_tanh",) * spaces.bounded)
-        # By which a gradient step multiplies the learning rate, between these divergences.
-        self._kl_bounds = torch.tensor([0.0, 0.5 * config.target_kl, 2.0 * config.target_kl], device=self.device)
-        self._lr_factors = torch.tensor([1.0, 1.5, 1.0, 1 / 1.5], device=self.device)
+
+    def _compile(self) -> None:
+        """Compiles its kernels all at once, instead of each where it is first launched."""
+        action = self.spaces.action, self.spaces.bounded, self._dtype
+        small = draw_of(*action), loss_of(*action), follow
+        self.optimizer.compile_with([(normalise_of(self._dtype), LARGE), *((kernel, SMALL) for kernel in small)])
+        if fast := [rows for rows in (self._mean, self._value) if rows.in_triton]:
+            mlp, weights = triton_kernels(), self.optimizer.wide(self._dtype)
+            parts = self.optimizer.parts(mlp.PARTS).detach()
+            mlp.compile_ahead([rows.own(weights) for rows in fast], self.config.minibatch_size, parts)
 
     def _read(self, td: TensorDictBase, key: str) -> Tensor:
         """Returns pixels as they are; other entries normalised, with zeros up to the length of the rows of weights."""
@@ -137,17 +143,25 @@ class PPO(Algorithm):
 
     def gradient_step(self, minibatch: TensorDictBase) -> Iterable[Tensor]:
         """Returns the metrics, a scalar each, of a step down the clipped loss, the critic's and the entropy's."""
-        config, weights = self.config, self.optimizer.wide(self._dtype)
+        config, weights, parts = self.config, self.optimizer.wide(self._dtype), self.optimizer.parts
+        self.optimizer.zero_grad()
         with self.beside():  # as are the slopes of what is computed there
-            value = self._value(minibatch[self.spaces.critic_key], weights)
-        outputs = self._mean(self.observed(minibatch), weights), self._std(), value
+            value = self._value(minibatch[self.spaces.critic_key], weights, parts)
+        outputs = self._mean(self.observed(minibatch), weights, parts), self._std(), value
         self.join()
         *slopes, metrics = clipped_loss(*outputs, minibatch, config, self.spaces.bounded)
-        self.optimizer.zero_grad()
         torch.autograd.backward(outputs, slopes)
+        self.join()  # autograd waits only for gradients that it adds up itself
         if config.target_kl:
             self._follow(metrics[self.metric_names.index("kl_approx")])
         return [*metrics, clip_and_step(self.optimizer, config.max_grad_norm)]
+
+    def minibatches(self, steps: TensorDictBase) -> Iterable[TensorDictBase]:
+        """Returns minibatches whose advantages have mean 0 and standard deviation 1."""
+        advantages = steps["advantage"].view(-1, self.config.minibatch_size)
+        spread, center = torch.std_mean(advantages, 1, keepdim=True)
+        advantages.sub_(center).div_(spread.nan_to_num(0.0).clamp(min=1e-6))  # one step has no deviation
+        return super().minibatches(steps)
 
     def schedule(self, progress: float) -> None:
         """Sets the learning rate, unless it follows the divergence."""
@@ -159,14 +173,23 @@ class PPO(Algorithm):
 
         A divergence that is not positive, as that of the first step of a batch, says nothing.
         """
-        kl = distributed.mean_of_ranks(kl).nan_to_num(0.0)
-        factor = self._lr_factors.take(torch.bucketize(kl, self._kl_bounds))
+        kl = distributed.mean_of_ranks(kl)
         for group in self.optimizer.param_groups:
-            group["lr"].mul_(factor).clamp_(*LR_RANGE)
+            launch(follow, 1, [kl.view(1), self.config.target_kl], [group["lr"].view(1)])
 
 
 # What is computed of each number, in one kernel each: torch would launch five to a hundred for it. torch.compile fuses
 # them as well, but takes half a minute for that at a first start.
+
+
+@wp.kernel(enable_backward=False)
+def follow(kl: wp.array[float], target: float, lr: wp.array[float]):
+    factor = float(1.0)
+    if kl[0] > 0.0 and kl[0] <= 0.5 * target:
+        factor = 1.5
+    if kl[0] > 2.0 * target:
+        factor = 1.0 / 1.5
+    lr[0] = wp.clamp(lr[0] * factor, LOWEST_LR, HIGHEST_LR)
 
 
 # A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
@@ -192,7 +215,7 @@ def normalised(rows: Tensor, norm: ObservationNorm, dtype: torch.dtype) -> Tenso
     norm.check(rows)
     wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // ALIGNED) * ALIGNED, dtype=dtype)
     flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])
-    launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out])
+    launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out], LARGE)
     return wide
 
 
@@ -259,8 +282,6 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
         advantage: wp.array[float],
         target: wp.array[float],
         noise: wp.array2d[float],
-        spread: wp.array[float],
-        center: wp.array[float],
         lowest: float,
         highest: float,
         entropy_coeff: float,
@@ -283,9 +304,8 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
                 entropy += 0.5 + constant
         log_ratio = log_prob - old_log_prob[step]
         clipped = wp.clamp(log_ratio, lowest, highest)
-        normal = (advantage[step] - center[0]) / wp.max(spread[0], 1.0e-6)
-        gain = wp.exp(log_ratio) * normal
-        clipped_gain = wp.exp(clipped) * normal
+        gain = wp.exp(log_ratio) * advantage[step]
+        clipped_gain = wp.exp(clipped) * advantage[step]
         slope = -gain
         if gain > clipped_gain:  # what is not a number is followed, to be seen
             slope = 0.0
@@ -325,11 +345,10 @@ def clipped_loss(
 ) -> tuple[Tensor, ...]:
     """Computes the slopes of PPO's loss: clipped objective, smooth L1 error of the critic and entropy bonus.
 
-    It is the loss of TorchRL's ``ClipPPOLoss`` with advantages normalised by minibatch. ``mean``, ``(n, nu)``, and
-    ``std``, ``(nu,)`` in all states, are those of the actions, before tanh, if they are bounded by it: their entropy is
-    that of one sample then. ``value`` is what the critic expects, ``(n, 1)``. ``data`` has of each step ``action``,
-    before tanh too, ``(n, nu)``, ``log_prob`` of that when it was drawn, ``(n,)``, ``advantage`` and ``value_target``,
-    ``(n, 1)``.
+    It is the loss of TorchRL's ``ClipPPOLoss``. ``mean``, ``(n, nu)``, and ``std``, ``(nu,)`` in all states, are those
+    of the actions, before tanh, if they are bounded by it: their entropy is that of one sample then. ``value`` is what
+    the critic expects, ``(n, 1)``. ``data`` has of each step ``action``, before tanh too, ``(n, nu)``, ``log_prob`` of
+    that when it was drawn, ``(n,)``, ``advantage``, normalised, and ``value_target``, ``(n, 1)``.
 
     Returns:
         The slopes by means, deviations and values, in their shapes; and of the metrics ``(5,)`` the means over the
@@ -337,73 +356,11 @@ def clipped_loss(
         and the fraction of steps whose ratio of probabilities is clipped.
     """
     steps, nu = mean.shape
-    spread, center = torch.std_mean(data["advantage"])
     noise = torch.randn(mean.shape, device=mean.device) if bounded else std.new_empty(0, nu)
     numbers = [data[name].reshape(steps) for name in ("log_prob", "advantage", "value_target")]
-    inputs = [mean, std, value, data["action"], *numbers, noise, spread.view(1), center.view(1)]
+    inputs = [mean, std, value, data["action"], *numbers, noise]
     slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(steps, METRICS + nu)
     bounds = math.log1p(-config.clip_epsilon), math.log1p(config.clip_epsilon)
     launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, config.entropy_coeff], slopes)
     means = slopes[2].mean(0)
     return slopes[0], means[METRICS:], slopes[1], means[:METRICS]
-
-
-# The networks.
-
-
-class Affine(torch.autograd.Function):
-    """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long."""
-
-    @staticmethod
-    def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        """Returns what the layer gives, shape ``(..., outputs)``."""
-        ctx.save_for_backward(rows, weight)
-        return nn.functional.linear(rows, weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        """Returns the slopes by rows, weight and bias."""
-        (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
-        of_bias = (slope.new_ones(1, len(slope)) @ slope)[0] if by_bias else None
-        return slope @ weight if by_rows else None, slope.mT @ rows if by_weight else None, of_bias
-
-
-class Rows:
-    """A network as a function of rows that are longer than it reads, by zeros, with other weights than its own.
-
-    Args:
-        network: layers one after the other; any other, as a critic may be, computes as a whole.
-        first: what gives the network its rows: a norm, which has been applied, or an encoder of pixels, which is part
-            of the function then.
-    """
-
-    def __init__(self, network: nn.Module, first: nn.Module) -> None:
-        self._encoder = first if isinstance(first, PixelEncoder) else None
-        self._inputs = inputs = self._encoder.features if self._encoder else len(first.mean)  # type: ignore[arg-type]
-        self._layers = [network]
-        with contextlib.suppress(TypeError):
-            layers = layers_of(network)
-            rows = torch.linspace(-1.0, 1.0, 4 * inputs, device=next(network.parameters()).device).view(4, inputs)
-            with torch.no_grad():  # a Sequential may have a forward of its own
-                found, expected = nn.Sequential(*layers)(rows.clone()), network(rows.clone())
-            self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
-
-    def __call__(self, rows: Tensor, weights: Mapping[nn.Parameter, Tensor]) -> Tensor:
-        """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well."""
-        if self._encoder:
-            own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}
-            rows = functional_call(self._encoder, own, (rows,)).to(next(iter(own.values())).dtype)
-        for index, layer in enumerate(self._layers):
-            reads_long = index == 0 and isinstance(layer, nn.Linear) and not self._encoder
-            if index == 0 and not reads_long:
-                rows = rows[..., : self._inputs].clone()  # an activation may write in place
-            own = {
-                name: whole if reads_long or whole.shape == part.shape else whole[..., : part.shape[-1]]
-                for name, part in layer.named_parameters()
-                for whole in (weights[part],)
-            }
-            if isinstance(layer, nn.Linear):
-                rows = Affine.apply(rows, own["weight"], own.get("bias"))
-            else:
-                rows = functional_call(layer, own, (rows,))
-        return rows
