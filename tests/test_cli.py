@@ -10,7 +10,8 @@ import tyro
 
 from torchrl_loco import __version__, cli, garbage
 from torchrl_loco.cli.errors import tolerate_broken_streams
-from torchrl_loco.cli.options import VALUES
+from torchrl_loco.cli.options import VALUES, _of_task
+from torchrl_loco.registry import resolve
 
 FRESH = """
 import sys
@@ -159,3 +160,30 @@ def test_what_the_command_imports_is_left_out_of_collections(monkeypatch):
         with garbage.importing():
             monkeypatch.setitem(sys.modules, module, sys)
     assert len(frozen) == 1
+
+
+TASK = """
+import torch
+from torchrl_loco import WalkerStand
+
+class Calm(WalkerStand):
+    options = {"wind": (False, "Whether it blows.")}
+
+    def reward(self, s):
+        return s.qpos[:, 0] + "1"
+
+class Windy(Calm):
+    wind = True
+"""
+
+
+def test_an_option_has_the_value_of_the_class_and_errors_in_a_hook_have_a_place(tmp_path, capsys):
+    """A flag that a subclass sets can be taken back; a slip in a task's file is found without a traceback."""
+    file = tmp_path / "task.py"
+    file.write_text(TASK)
+    for name, blows in (("Calm", False), ("Windy", True)):
+        resolve(f"{file}:{name}", by_user=True)
+        assert _of_task(f"{file}:{name}")["wind"][0] == blows
+    with pytest.raises(SystemExit):
+        cli.main(["train", f"{file}:Windy", "--device", "cpu", "--no_wind", "--out", str(tmp_path)])
+    assert f"({file}, line 9, in reward)" in capsys.readouterr().err

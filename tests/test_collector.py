@@ -19,6 +19,7 @@ from torchrl.envs import (
     ObservationNorm,
     RewardSum,
     StepCounter,
+    TransformedEnv,
     VecNormV2,
 )
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -454,3 +455,14 @@ def test_its_state_goes_on_where_the_reward_has_other_terms():
         assert torch.equal(after["observation"], expected)
         found = {name: term.unique().item() for name, term in after["reward_terms"].items()}
         assert found == {name: len(name) for name in names}
+
+
+def test_a_state_does_not_stay_in_batches_of_torchrls_transforms():
+    """Whose ``reset`` returns it, and a batch would repeat it at every step."""
+    collectors = []
+    for _ in range(2):
+        env = TransformedEnv(torchrl_loco.make("walker_stand", 2, "cpu", 0), RewardSum())
+        collectors.append(RolloutCollector(env, env.rand_action, frames_per_batch=8))
+    before = collectors[0].rollout()
+    collectors[1].load_state_dict(collectors[0].state_dict())
+    assert set(collectors[1].rollout().keys(True)) == set(before.keys(True))

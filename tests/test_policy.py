@@ -11,7 +11,7 @@ from torch import nn
 
 import torchrl_loco
 from torchrl_loco import storage
-from torchrl_loco.policy import ObservationNorm, Policy, shipped_policies
+from torchrl_loco.policy import ObservationNorm, Policy, in_task, shipped_policies
 from torchrl_loco.sim import models
 from torchrl_loco.training import evaluate_policy
 
@@ -185,3 +185,12 @@ def test_another_bodys_observations_are_refused(policy, shared):
     env = shared("humanoid_run", 2)
     with pytest.raises(Exception, match="takes observations of size 24, got size 67"):
         env.rollout(1, policy)
+
+
+def test_what_a_policy_earned_is_of_its_task():
+    """In another task neither that holds, nor options that it does not have."""
+    info = {"protocol": "playground", "mean": 12.5, "selected_by": 13.0, "options": {"future": (1, 2), "speed": 2.0}}
+    assert in_task(info, "walker_stand", "walker_stand") == {**info, "task": "walker_stand"}
+    assert in_task(info, "a.py:Walk", "b.py:Walk")["mean"] == 12.5
+    assert in_task(info, "walker_stand", "walker_walk") == {"protocol": "playground", "task": "walker_walk"}
+    assert in_task(info, "walker_stand", "g1_tracking")["options"] == {"future": (1, 2)}

@@ -103,7 +103,10 @@ def check_choice(name: str, value: Any, choices: Collection[str], also: Collecti
     """Returns ``value``; of ``also``, such as aliases, the message may suggest names too."""
     if not isinstance(value, str) or value not in choices:
         hint = suggestion(str(value), [*choices, *also])
-        raise ValueError(f"unknown {name} {value!r}{hint}: choose one of {', '.join(choices)}")
+        raise ValueError(
+            f"unknown {name} {value!r}{hint}: "
+            + (f"choose one of {', '.join(choices)}" if choices else "there is none")
+        )
     return value
 
 

@@ -24,7 +24,7 @@ from torchrl.modules import SafeProbabilisticModule
 
 from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.state import State
+from torchrl_loco.envs.state import State, without_state
 from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS, load_transforms, state_of_transforms, unwrap
 from torchrl_loco.sim import TorchGraph
 
@@ -225,7 +225,9 @@ class RolloutCollector:
             if worlds != own:
                 raise ValueError(f"the state is of {worlds[0]} worlds from {worlds[1]} on, not {own[0]} from {own[1]}")
             size, device = self._env.batch_size, self._env.device
-            begin = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
+            returned = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
+            begin = without_state(returned, device)  # TorchRL's TransformedEnv returns it too
+            assert begin is not None
             carried = TensorDict(state["carried"], batch_size=size, device=device)
             kept = carried.select(*begin.keys(True, True), *state.get("remembered", ()), strict=False)
             self._carried = begin.update(kept)

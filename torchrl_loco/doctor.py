@@ -59,7 +59,7 @@ def diagnose(body: str = "walker") -> Iterator[Finding]:
         tasks = {body: tasks[body]}
     elif body != "all":
         if not is_place(body):
-            check_choice("body or task", body, list_envs(), also=[*tasks, "all"])
+            check_choice("body or task", body, [*tasks, "all", *list_envs()])
         tasks = {body: task_name(body, by_user=True)}
     yield Finding("python", f"{platform.python_version()} on {platform.platform()}")
     yield Finding("torchrl-loco", torchrl_loco.__version__)

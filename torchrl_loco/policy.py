@@ -16,7 +16,7 @@ from torchrl_loco import storage
 from torchrl_loco.checks import check_choice, check_device
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.registry import canonical_id
+from torchrl_loco.registry import canonical_id, resolve
 
 SHIPPED = Path(__file__).parent / "policies"  # has a folder for each protocol
 
@@ -79,6 +79,22 @@ def moments(observation: torch.Tensor) -> tuple[int, torch.Tensor, torch.Tensor]
     batch = observation.reshape(-1, observation.shape[-1])
     var, mean = torch.var_mean(batch, dim=0, correction=0)
     return len(batch), mean, var
+
+
+EARNED = ("mean", "std", "min", "max", "episodes", "selected_by")  # of a policy's info, in the task of its training
+
+
+def in_task(info: Mapping[str, Any], trained: str, task: str) -> dict[str, Any]:
+    """Returns what a policy's info says in a task: in another than that of its training not what it earned.
+
+    Nor are there options of the training that the other task lacks.
+    """
+    if task.rpartition(":")[2] == trained.rpartition(":")[2]:
+        return {**info, "task": task}
+    kept = {name: value for name, value in info.items() if name not in EARNED}
+    own = resolve(task).options if "options" in kept else {}
+    options = {name: value for name, value in kept.pop("options", {}).items() if name in own}
+    return {**kept, "task": task, **({"options": options} if options else {})}
 
 
 class Policy(TensorDictModule):

@@ -22,7 +22,7 @@ from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.envs.vary import Vary
-from torchrl_loco.policy import check_terms
+from torchrl_loco.policy import check_terms, in_task
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 
@@ -65,6 +65,7 @@ class Exported:
         if "task" not in self.facts:
             raise ValueError(f"{path} does not say its task: it must be a file that torchrl-loco export wrote")
         if task is not None:
+            self.facts["info"] = in_task(self.facts.get("info", {}), self.facts["task"], task)
             self.facts["task"] = task
         self.reads = "pixels" if self.facts.get("info", {}).get("from_pixels") else "observation"
 

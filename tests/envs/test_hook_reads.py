@@ -246,3 +246,23 @@ def test_forces_of_actuators_are_mujocos():
     lifts = type("Lift", (QuadrupedWalk,), {"reward": lambda self, s: s.actuator_force.sum(-1)})
     with pytest.raises(ValueError, match="motors and servos at hinges and slides"):
         lifts(1, "cpu", engine="mujoco")
+
+
+def test_an_environment_does_not_move_or_change_its_type():
+    env = Pendulum(num_envs=1, device="cpu", seed=0)
+    assert env.cpu() is env
+    for convert in (env.double, env.half, env.bfloat16):
+        with pytest.raises(TypeError, match="it computes in float32"):
+            convert()
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="no device 'cuda'"):
+            env.cuda()
+
+
+def test_draws_between_bounds_in_the_wrong_order_are_refused():
+    class Wrong(Pendulum):
+        def begin(self, s):
+            return {"qpos": s.uniform(1.0, 0.0, 1)}
+
+    with pytest.raises(ValueError, match="the first must be the lower"):
+        Wrong(num_envs=1, device="cpu", seed=0)

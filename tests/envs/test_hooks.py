@@ -20,6 +20,7 @@ from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.view import View
+from torchrl_loco.training.environments import content_of
 
 SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
 CONFIG = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=20, ls_iterations=20, euler_damping=True)
@@ -852,15 +853,35 @@ def test_an_episode_is_cut_off_by_its_own_hook(device):
         assert td["observation"][:, at + 1].allclose(torch.tensor(3.0, device=env.device))
 
 
+def test_metrics_may_be_none():
+    class Silent(Falling):
+        def metrics(self, s):
+            return {}
+
+    env = Silent(2, "cpu", 0, metrics=True, on_overflow="ignore")
+    assert env.rollout(2).shape == (2, 2)
+
+
+def test_options_that_change_a_run_change_its_content():
+    """As a file does that is edited: its best policy was selected by other returns."""
+    contents = [content_of("falling", Falling(1, "cpu", 0, height=height)) for height in (1.0, 2.0, 2.0)]
+    assert contents[0] != contents[1] == contents[2]
+
+
 def test_options_are_arguments_attributes_and_part_of_a_run(tmp_path):
     env = Falling(1, "cpu", 0, height=2.0, on_overflow="ignore")
     assert (env.height, env.steps) == (2.0, 5)
     assert env.options_given == env.settings()["options"] == {"height": 2.0}
     with pytest.raises(ValueError, match="unknown argument 'heigth', did you mean 'height'"):
         Falling(1, "cpu", 0, heigth=2.0)
-    for options in ({"height": 1.0}, {"reward": (1.0, "taken")}, {"sim_dt": (0.1, "taken")}):
+    wrong = [1.0, ([1.0], "of a kind that no word can name"), (None, "of none"), ((1, 2.5), "of two kinds")]
+    for options in ({"reward": (1.0, "taken")}, {"sim_dt": (0.1, "taken")}, *({"speed": value} for value in wrong)):
         with pytest.raises((TypeError, ValueError), match=r"Wrong\.options"):
             type("Wrong", (Falling,), {"options": options})(1, "cpu")
+    with pytest.raises(TypeError, match="speed is an option, whose value belongs in options"):
+        type("Twice", (Falling,), {"options": {"speed": (1.0, "Speed (m/s).")}, "speed": 2.0})(1, "cpu")
+    with pytest.raises(ValueError, match="'gpus' is a setting of training, too"):
+        training.preset(type("Taken", (Falling,), {"options": {"gpus": (1, "Cards.")}}), "cpu")
     config = training.preset(Falling, "cpu", height=3.0)
     assert config.options == {"height": 3.0}
     assert config.of_env["height"] == 3.0

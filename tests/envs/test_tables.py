@@ -202,6 +202,19 @@ def test_a_closed_environment_goes_on_at_its_stage():
     assert env.get_stage() == {"shared": {"steps": 4.0}, "memory": {"level": [4.0, 4.0]}}
 
 
+def test_each_world_goes_on_at_its_own_level():
+    """Also of more worlds than a stage keeps."""
+    closed, open_ = Levels(70, "cpu", 0), Levels(70, "cpu", 0)
+    for env in (closed, open_):
+        env.set_stage({"memory": {"level": [float(i) for i in range(70)]}})
+    closed.close()
+    open_.reset()
+    closed.reset()
+    levels = [env.get_state()["memory", "level"] for env in (closed, open_)]
+    assert levels[1].max() - levels[1].min() == 69.0
+    assert torch.equal(*levels)
+
+
 def test_what_is_shared_may_begin_with_numbers():
     class Begun(Levels):
         shared = {"steps": torch.tensor(5.0)}

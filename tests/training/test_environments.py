@@ -6,7 +6,15 @@ import pytest
 import torch
 from small_runs import EPISODE, SMALL
 from torchrl.data import Bounded, Unbounded
-from torchrl.envs import FrameSkipTransform, StepCounter, Transform, TransformedEnv, UnsqueezeTransform
+from torchrl.envs import (
+    Compose,
+    FrameSkipTransform,
+    RewardSum,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+    UnsqueezeTransform,
+)
 
 import torchrl_loco
 from torchrl_loco import LocoEnv, WalkerWalk
@@ -84,6 +92,16 @@ def test_a_held_action_ends_where_the_world_does():
     after = short.step(short.reset().set("action", torch.full((2, 6), 0.3)))["next"]
     assert (after["truncated"] & ~after["terminated"]).all()
     assert (after["reward"] == 2.0).all()
+
+
+def test_what_does_not_go_with_held_actions_is_refused():
+    with pytest.raises(TypeError, match="frame_skip must be an integer"):
+        ActionRepeat(2.5)
+    env = torchrl_loco.TransformedEnv(Stumble(2, "cpu", seed=0), Compose(RewardSum(), ActionRepeat(2)))
+    with pytest.raises(ValueError, match="RewardSum must come after ActionRepeat"):
+        env.rollout(1)
+    with pytest.raises(ValueError, match="leave ActionRepeat out, and pass action_repeat"):
+        env.view(lambda td: td)
 
 
 def test_lengths_of_episodes(tmp_path):

@@ -219,7 +219,7 @@ def test_what_an_edit_changes_is_noticed(tmp_path):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     frames = {"place": torch.zeros(3, 2)}
-    env = SimpleNamespace(hooks=SimpleNamespace(catalog=SimpleNamespace(constants=frames)))
+    env = SimpleNamespace(hooks=SimpleNamespace(catalog=SimpleNamespace(constants=frames)), options={})
 
     def content():
         known_files.remember(tmp_path / "task.py")
@@ -276,7 +276,9 @@ def test_a_class_in_a_file(tmp_path, monkeypatch, capsys):
     rewrite(edited)
     for frames, said in ((512, True), (640, False)):  # by the second time the checkpoint is of the new one
         assert cli.main(["resume", str(path), f"--total_frames={frames}"]) == 0
-        assert ("StandShaky (a file of it, its model or a motion) was edited since" in capsys.readouterr().err) == said
+        assert (
+            "StandShaky (a file or option of it, its model or a motion) was edited since" in capsys.readouterr().err
+        ) == said
     assert run.load_policy("cpu").info["frames"] >= 512  # the best of those that were evaluated in this task
     rewrite(edited + "\n    def observation(self, s):\n        return s.qpos\n")
     with pytest.raises(SystemExit):

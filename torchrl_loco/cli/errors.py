@@ -3,10 +3,15 @@
 import contextlib
 import os
 import sys
+import sysconfig
+import traceback
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, TextIO
 
 from torchrl_loco.checks import UnknownNameError
+
+PACKAGE = Path(__file__).parents[1]
 
 
 def process_name() -> str:
@@ -42,6 +47,15 @@ def tolerate_broken_streams() -> None:
         setattr(sys, name, BestEffortStream(stream))
 
 
+def _place_of(error: Exception) -> str:
+    """Returns where an error was raised if that is in a file of the user's own, such as that of a task."""
+    raised = traceback.extract_tb(error.__traceback__)[-1]
+    theirs = (str(PACKAGE), *(sysconfig.get_path(kind) for kind in ("stdlib", "platlib", "purelib")))
+    if raised.filename.startswith((*theirs, "<")):
+        return ""
+    return f" ({raised.filename}, line {raised.lineno}, in {raised.name})"
+
+
 @contextlib.contextmanager
 def user_errors(*kinds: type[Exception]) -> Iterator[None]:
     """Prints errors of the user, or errors of the given kinds, in one line and exits with status 2."""
@@ -49,5 +63,5 @@ def user_errors(*kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        print(f"{process_name()}: {error}", file=sys.stderr)
+        print(f"{process_name()}: {error}{_place_of(error)}", file=sys.stderr)
         raise SystemExit(2) from None

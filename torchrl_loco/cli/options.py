@@ -121,9 +121,15 @@ def _options(config: TrainingConfig) -> TrainingConfig:
 
 
 def _of_task(task: str) -> Mapping[str, tuple[Any, str]]:
-    """Returns the options of a task, which is imported only if it has any."""
+    """Returns the options of a task, with the values that its class has; it is imported only if it has any."""
     found = tasks.found().get(task)
-    return {} if found is not None and not found.has_options else resolve(task).options
+    if found is not None and not found.has_options:
+        return {}
+    cls = resolve(task)
+    from torchrl_loco.envs.task import options_of_class  # with torch, as the class is
+
+    values = options_of_class(cls)
+    return {name: (values.get(name, value), words) for name, (value, words) in cls.options.items()}
 
 
 def _annotated(value: Any, words: str) -> Any:

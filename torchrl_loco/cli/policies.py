@@ -24,8 +24,6 @@ from torchrl_loco.registry import label, resolve, task_name
 from torchrl_loco.training.config import check_video
 from torchrl_loco.viewer.settings import LOOPBACK, PORT, PORTS, SHARE, WORLDS, check_host, check_viewer
 
-EARNED = ("mean", "std", "min", "max", "episodes", "selected_by")  # of a policy's info, in the task of its training
-
 CONTAINERS = (".mp4", ".mkv", ".mov")  # suffixes of a video
 
 RunOrTask = Annotated[
@@ -97,10 +95,7 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
     if not source.is_dir():
         policy = torchrl_loco.Policy.load(source, device)
         trained = policy.info["task"]
-        policy.info["task"] = task or place_of(trained, source.parent)
-        if policy.info["task"].rpartition(":")[2] != trained.rpartition(":")[2]:
-            for figure in EARNED:  # what it earned is of another task
-                policy.info.pop(figure, None)
+        policy.info = torchrl_loco.policy.in_task(policy.info, trained, task or place_of(trained, source.parent))
         return policy, source
     run = training.RunFolder(source, task)
     if run.policy.is_file() or run.given or not run.has_checkpoint:

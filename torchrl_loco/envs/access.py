@@ -85,7 +85,7 @@ class WorldAccess(Task, EnvBase):
             raise_if_closed: ignored; part of TorchRL's signature.
         """
         super().close(raise_if_closed=False)
-        stage = self.get_stage() if self._world is not None else {}
+        stage = self._stage_of(self.num_envs) if self._world is not None else {}
         world, self._world = self._world, None
         if world is not None:
             self._episodes, self._stage = world.episode.torch.cpu(), stage
@@ -289,9 +289,13 @@ class WorldAccess(Task, EnvBase):
         That is :attr:`shared`, and of :attr:`memory` the entries that :meth:`begin` makes from their former values, as
         a level, in at most 64 worlds, evenly spread. Training keeps it with checkpoint and policy.
         """
+        return self._stage_of(min(self.num_envs, STAGE_WORLDS))
+
+    def _stage_of(self, count: int) -> dict[str, Any]:
+        """Returns the stage, with what is in memory in so many worlds."""
         if not (self.world.shared or self.hooks.carried):
             return {}
-        rows = torch.linspace(0, self.num_envs - 1, min(self.num_envs, STAGE_WORLDS)).round().long()
+        rows = torch.linspace(0, self.num_envs - 1, count).round().long()
         memory = {name: self.world.memory[name].cpu()[rows].tolist() for name in self.hooks.carried}
         return {"shared": {name: values.tolist() for name, values in self.world.shared.items()}, "memory": memory}
 

@@ -415,6 +415,26 @@ class LocoEnv(WorldAccess, QuickResets):
         elif self._episodes is not None:
             self._episodes.zero_()
 
+    def double(self) -> "LocoEnv":
+        """Raises, as :meth:`to` does: an environment computes in float32."""
+        return self.to(torch.float64)
+
+    def half(self) -> "LocoEnv":
+        """Raises, as :meth:`to` does."""
+        return self.to(torch.float16)
+
+    def bfloat16(self) -> "LocoEnv":
+        """Raises, as :meth:`to` does."""
+        return self.to(torch.bfloat16)
+
+    def cuda(self, device: int | torch.device | None = None) -> "LocoEnv":
+        """Returns the environment itself if it lives there: see :meth:`to`."""
+        return self.to(torch.device("cuda", device) if isinstance(device, int) else device or "cuda")
+
+    def cpu(self) -> "LocoEnv":
+        """Returns the environment itself if it lives there: see :meth:`to`."""
+        return self.to("cpu")
+
     def to(self, device: Any) -> "LocoEnv":
         """Returns the environment itself if it lives on ``device``; the physics cannot move.
 

@@ -357,7 +357,7 @@ class Hooks:
         for hook, flag in ENDS.items():
             if hook in self.own:
                 a[flag].copy_(self._call(hook, a, steps=1))
-        if "metrics" in self.own:
+        if self.metric_names:
             a["metrics"].copy_(torch.stack([value.float() for value in self._metrics(a).values()], dim=-1))
         rows = self._rows("events", a, {**self.catalog.memory, **self._pose})
         if changed := [(rows[name] != a[name]).any(-1) for name in self._pose if name in rows]:

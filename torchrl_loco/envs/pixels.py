@@ -46,6 +46,8 @@ class Pixels:
         """Returns what arguments of :class:`torchrl_loco.LocoEnv` ask for, ``None`` if that is no pixels."""
         with_rgb = check_bool("from_pixels", given["from_pixels"])
         far = check_float("depth, the greatest that is seen (m) or 0 for none,", given["depth"], DEPTHS)
+        if given["frame_stack"] is not None and not with_rgb:
+            raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         if not with_rgb and not far:
             if extra := [name for name in ("pixels_only", "camera", "size", "frame_stack") if given[name] is not None]:
                 raise ValueError(f"{extra[0]} needs from_pixels=True, or the greatest depth to be seen (m) as depth")
@@ -54,8 +56,6 @@ class Pixels:
         width, height = checked_size(SIZE if given["size"] is None else given["size"])
         kinds = tuple(kind for kind, wanted in (("rgb", with_rgb), ("depth", far > 0)) if wanted)
         only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
-        if given["frame_stack"] is not None and not with_rgb:
-            raise ValueError("frame_stack needs from_pixels=True: depth is not stacked")
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
         of_pixel = COPIES_IN_STEP * sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
         of_pixel += 3 * stack * (stack > 1)  # Seen.stack

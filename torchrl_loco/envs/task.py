@@ -436,6 +436,18 @@ def check_options(cls: type[Task]) -> None:
             raise TypeError(f"{cls.__name__}.options[{name!r}] must be a value and what it is for, got {entry!r}")
         if name in taken or not str(name).isidentifier() or str(name).startswith("_"):
             raise ValueError(f"{cls.__name__}.options: {name!r} is no name that an option can have")
+        value = entry[0]
+        kinds = {type(each) for each in (value if isinstance(value, tuple) else [value])}
+        if len(kinds) > 1 or not kinds <= {bool, int, float, str}:
+            raise TypeError(
+                f"{cls.__name__}.options[{name!r}] must be True or False, a number, text or a tuple of one of these, "
+                f"not {value!r}"
+            )
+        *_, declares = (base for base in cls.__mro__ if name in vars(base).get("options", {}))
+        if name in vars(declares):
+            raise TypeError(
+                f"{declares.__name__}: {name} is an option, whose value belongs in options, and an attribute"
+            )
 
 
 SAID_ELSEWHERE = {

@@ -2,7 +2,7 @@
 
 import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 from torchrl.envs import TransformedEnv as TorchRLTransformedEnv
 from torchrl.envs import transforms as t
 
+from torchrl_loco.checks import check_int
 from torchrl_loco.envs.resets import reset_done_worlds, rows_of
 from torchrl_loco.envs.state import without_state
 
@@ -23,16 +24,26 @@ class ActionRepeat(FrameSkipTransform):
     count its end more than once.
     """
 
-    _said = False
+    _checked = False
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        parent: Any = self.parent
-        if not self._said and "adapt" in getattr(unwrap(parent)[0].hooks, "own", ()):
-            self._said = True
+    def __init__(self, frame_skip: int = 1) -> None:
+        super().__init__(check_int("frame_skip", frame_skip))
+
+    def _check(self, parent: Any) -> None:
+        """Checks what lies below: a ``RewardSum`` there would see the last control step of an action alone."""
+        self._checked = True
+        if any(isinstance(transform, t.RewardSum) for transform in named_transforms(parent).values()):
+            raise ValueError("RewardSum must come after ActionRepeat, whose rewards it is to sum")
+        if "adapt" in getattr(unwrap(parent)[0].hooks, "own", ()):
             logging.getLogger("torchrl_loco").warning(
                 "adapt() counts an episode that ends within an action of ActionRepeat more than once: pass a longer "
                 "ctrl_dt instead"
             )
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        parent: Any = self.parent
+        if not self._checked:
+            self._check(parent)
         for _ in range(self.frame_skip - 1):
             before, after = next_tensordict, parent._step(tensordict)
             over = before.get("done")
@@ -145,6 +156,23 @@ class TransformedEnv(TorchRLTransformedEnv):
         of_transforms = {name: value for name, value in state_dict.items() if name not in of_env}
         super().load_state_dict(of_transforms, strict=strict, **kwargs)
         self.base_env.load_state_dict({name.removeprefix(BASE): value for name, value in of_env.items()}, strict=strict)
+
+    def view(self, policy: Callable[[TensorDictBase], TensorDictBase], **settings: Any) -> Any:
+        """Plays a policy, which reads what the transforms make, in the browser.
+
+        Args:
+            policy: reads what the transforms return.
+            settings: further ones of :meth:`LocoEnv.view`.
+
+        Returns:
+            The viewer.
+
+        Raises:
+            ValueError: a transform holds actions, which is :meth:`LocoEnv.view`'s ``action_repeat``.
+        """
+        if any(isinstance(transform, FrameSkipTransform) for transform in named_transforms(self).values()):
+            raise ValueError("view holds actions itself: leave ActionRepeat out, and pass action_repeat")
+        return type(unwrap(self)[0]).view(self, policy, **settings)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""

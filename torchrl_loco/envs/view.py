@@ -553,7 +553,12 @@ class View:
         """Returns draws from [low, high), ``(num_envs, *shape)``, a function of (seed, world, episode, step).
 
         The same numbers come for any number of worlds and at every run; on another device up to rounding.
+
+        Raises:
+            ValueError: ``low`` is above ``high``, if both are numbers.
         """
+        if isinstance(low, int | float) and isinstance(high, int | float) and low > high:
+            raise ValueError(f"uniform draws from {low} to {high}: the first must be the lower")
         return low + (high - low) * self._units_in(shape, 1)[0]
 
     def normal(self, *shape: int) -> torch.Tensor:

@@ -534,8 +534,11 @@ def preset(
     own: Mapping[str, Mapping[str, Any]] = {}
     if on_cuda or task not in tasks.found():  # importing one of ours takes seconds
         cls = resolve(task)
+        from torchrl_loco.envs.task import check_options  # with torch, as the class is
+
+        check_options(cls)  # before the parser of the command line meets them
         of_training = {field.name for each in CONFIGS.values() for field in dataclasses.fields(each)}
-        if taken := sorted(of_training.intersection(cls.options)):
+        if taken := sorted({*of_training, "gpus", "seeds"}.intersection(cls.options)):
             raise ValueError(f"{cls.__name__}.options: {taken[0]!r} is a setting of training, too: rename it")
         where = f"in the presets of {cls.__name__}"
         for name, settings in cls.presets.items():

@@ -19,7 +19,7 @@ import torch
 from torchrl_loco import known_files, storage
 from torchrl_loco.checks import check_device, check_run
 from torchrl_loco.envs.task import folder_of
-from torchrl_loco.policy import Policy
+from torchrl_loco.policy import Policy, in_task
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
 from torchrl_loco.training import distributed
@@ -226,7 +226,7 @@ class RunFolder:
         policy, task = Policy.load(self.policy, device), self.load_config().task
         if policy.info["task"] != task:
             raise ValueError(f"{self.policy} is a policy for {policy.info['task']}, but the run is of {task}")
-        policy.info["task"] = self.task
+        policy.info = in_task(policy.info, task, self.task)
         return policy
 
     @property

@@ -514,8 +514,8 @@ class Trainer:
             )
         if was_edited and distributed.is_first():
             print(
-                f"{self.run.task} (a file of it, its model or a motion) was edited since the checkpoint: the run goes "
-                "on as it is now, and its best policy is selected anew",
+                f"{self.run.task} (a file or option of it, its model or a motion) was edited since the checkpoint: the "
+                "run goes on as it is now, and its best policy is selected anew",
                 file=sys.stderr,
             )
         terms = checkpoint.get("terms", self._terms)
