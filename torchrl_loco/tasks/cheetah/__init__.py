@@ -15,15 +15,8 @@ from torchrl_loco.envs.world import World
 from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
 
-RUN_SPEED = 10.0  # horizontal speed that counts as running (m/s)
-
 SETTLED_STATES = 512  # states in the table from which episodes start
 SETTLING_TIME = 2.0  # time for which a random pose settles (s): 200 physics steps of 0.01 s
-
-
-@wp.func
-def cheetah_reward(horizontal_velocity: float, target_speed: float) -> float:
-    return tolerance(horizontal_velocity, target_speed, wp.inf, target_speed, Sigmoid.LINEAR, 0.0)
 
 
 @wp.struct
@@ -42,7 +35,8 @@ def observe_cheetah(world: int, inputs: CheetahInputs, observation: wp.array[flo
     k = observe_row(inputs.qpos[world], 1, observation, 0)  # without the position along x
     k = observe_row(inputs.qvel[world], 0, observation, k)
 
-    move = cheetah_reward(inputs.sensordata[world, inputs.torso_velocity], inputs.target_speed)  # along x
+    speed, target = inputs.sensordata[world, inputs.torso_velocity], inputs.target_speed  # along x
+    move = tolerance(speed, target, wp.inf, target, Sigmoid.LINEAR, 0.0)
     terms[0] = move
     return move
 
@@ -77,7 +71,7 @@ class CheetahRun(LocoEnv):
     observation_names = {"positions": 8, "velocities": 9}
     term_names = ("move",)
     presets = {"reppo": {"total_frames": 30_000_000, "lr": 1e-3, "minibatch_size": 4096, "min_temperature": 1e-9}}
-    target_speed = RUN_SPEED
+    target_speed = 10.0  # m/s
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""

@@ -15,7 +15,6 @@ from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
 STAND_HEIGHT = wp.constant(0.6)  # height of the torso above the foot from which the hopper counts as standing (m)
 MAX_HEIGHT = wp.constant(2.0)  # height up to which it counts as standing (m), more than its length
-HOP_SPEED = 2.0  # horizontal speed that counts as hopping (m/s)
 
 
 @wp.func
@@ -151,6 +150,6 @@ class HopperHop(Hopper):
         center of mass's along x.
     """
 
-    target_speed = HOP_SPEED
+    target_speed = 2.0
     term_names = ("standing", "hopping")
     presets = {"reppo": {**HopperStand.presets["reppo"], "total_frames": 160_000_000}}

@@ -14,8 +14,6 @@ from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import FreePose, draw_free_pose, make_skeleton
 
 STAND_HEIGHT = wp.constant(1.4)  # height of the head from which the humanoid counts as standing (m)
-WALK_SPEED = 1.0  # horizontal speed that counts as walking (m/s)
-RUN_SPEED = 10.0  # horizontal speed that counts as running (m/s)
 
 EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")  # bodies whose position is observed, in order
 ROOT_QPOS = wp.constant(7)  # numbers of qpos that place the root: position and quaternion; the hinges follow
@@ -186,7 +184,7 @@ class HumanoidWalk(Humanoid):
         ``fast = tolerance(|v_xy|, [1 m/s, inf), margin 1 m/s, linear, value_at_margin 0)``.
     """
 
-    target_speed = WALK_SPEED
+    target_speed = 1.0
     presets = {"reppo": {**HumanoidStand.presets["reppo"], "total_frames": 100_000_000, "bf16": True}}
 
 
@@ -196,5 +194,5 @@ class HumanoidRun(Humanoid):
     As :class:`HumanoidWalk`, with target and margin of 10 m/s.
     """
 
-    target_speed = RUN_SPEED
+    target_speed = 10.0
     presets = {"reppo": {"total_frames": 300_000_000, "episode_length": 200}}

@@ -13,8 +13,6 @@ from torchrl_loco.rewards import Sigmoid, tolerance
 from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import RootAboveFloor, draw_orientation_above_floor, make_outline
 
-WALK_SPEED = 0.5  # forward speed that counts as walking (m/s)
-RUN_SPEED = 5.0  # forward speed that counts as running (m/s)
 INCREMENT = 0.01  # a start is raised in steps of this height until it is off the floor (m)
 
 ROOT_QPOS = wp.constant(7)  # numbers of qpos that place the root: position and quaternion; the hinges follow
@@ -105,7 +103,7 @@ class Quadruped(LocoEnv):
         "foot_forces": 24,
     }
     term_names = ("upright", "move")
-    target_speed = WALK_SPEED
+    target_speed = 0.5
 
     def observation_func(self, world: World) -> tuple[wp.Function, Any]:
         """Returns the function that writes observation and reward, and its inputs."""
@@ -163,5 +161,5 @@ class QuadrupedRun(Quadruped):
     As :class:`QuadrupedWalk`, with target and margin of 5 m/s.
     """
 
-    target_speed = RUN_SPEED
+    target_speed = 5.0
     presets = {"reppo": {**QuadrupedWalk.presets["reppo"], "total_frames": 50_000_000}}

@@ -14,8 +14,6 @@ from torchrl_loco.sim import fill
 from torchrl_loco.sim.sampling import PlanarBody, draw_pitch_and_hinges
 
 STAND_HEIGHT = wp.constant(1.2)  # height of the torso from which the walker counts as standing (m)
-WALK_SPEED = 1.0  # horizontal speed that counts as walking (m/s)
-RUN_SPEED = 8.0  # horizontal speed that counts as running (m/s)
 
 SHORT_EPISODES = {
     "lr": 1e-3,
@@ -152,7 +150,7 @@ class WalkerWalk(Walker):
         center of mass's along x.
     """
 
-    target_speed = WALK_SPEED
+    target_speed = 1.0
     term_names = ("stand", "move")
     presets = {"reppo": {**SHORT_EPISODES, "total_frames": 19_000_000, "eval_interval": 2_000_000, "bf16": True}}
 
@@ -163,7 +161,7 @@ class WalkerRun(Walker):
     As :class:`WalkerWalk`, with a target of 8 m/s and a margin of 4 m/s.
     """
 
-    target_speed = RUN_SPEED
+    target_speed = 8.0
     term_names = ("stand", "move")
     presets = {
         "reppo": {
