@@ -259,14 +259,14 @@ class Hooks:
 
     def _joined(self, view: View, group: str, values: Any) -> torch.Tensor:
         """Returns a group of the observation: the tensor that a hook returned, or its terms in their order."""
-        terms = values if isinstance(values, Mapping) else {group: values}
+        named = isinstance(values, Mapping)
+        terms = values if named else {group: values}
         if not self.catalog.complete:
             if not terms:
                 raise ValueError(f"{self._title}.observation: {group!r} has no terms")
             for term, rows in terms.items():
                 self._check_term(group, term, rows)
             self._shapes[group] = {term: tuple(rows.shape[1:]) for term, rows in terms.items()}
-            named = isinstance(values, Mapping)
             self.terms[group] = {term: rows[0].numel() for term, rows in terms.items()} if named else {}
         found = []
         for term, rows in terms.items():
@@ -278,7 +278,7 @@ class Hooks:
                     drawn = drawn + (offset if self._noise_scale == 1.0 else self._noise_scale * offset)
                 rows = rows + drawn
             found.append(rows)
-        if not isinstance(values, Mapping):
+        if not named:
             return found[0]
         return torch.cat([rows.unsqueeze(-1) if rows.ndim == 1 else rows.flatten(1) for rows in found], dim=-1)
 
@@ -326,13 +326,13 @@ class Hooks:
         return {name: row.expand((*first, *known[name].shape)) for name, row in rows.items()}
 
     def _check(self, hook: str, values: Any, shape: tuple[int, ...], name: str = "") -> None:
+        what = f"{self._title}.{hook}{_of(name)} must return"
         if not isinstance(values, torch.Tensor):
-            raise TypeError(f"{self._title}.{hook}{_of(name)} must return a tensor, got {_kind(values)}")
+            raise TypeError(f"{what} a tensor, got {_kind(values)}")
         if tuple(values.shape) != shape:
-            what = f"{self._title}.{hook}{_of(name)}"
-            raise ValueError(f"{what} must return shape {shape}, the worlds first, got {tuple(values.shape)}")
+            raise ValueError(f"{what} shape {shape}, the worlds first, got {tuple(values.shape)}")
         if values.device != self.catalog.device:
-            raise ValueError(f"{self._title}.{hook}{_of(name)} must return a tensor on {self.catalog.device}")
+            raise ValueError(f"{what} a tensor on {self.catalog.device}")
 
     # The parts of a control step, in their order. Each reads and writes arrays of all worlds in place.
 
@@ -435,15 +435,14 @@ class Hooks:
         return (a["overflow"] & int(Overflow.INDEX_OF_INTEGERS)) != 0 if has_tables else False
 
     def _remember(self, a: Arrays, rows: Mapping[str, torch.Tensor], mask: torch.Tensor | None = None) -> None:
-        new = {}  # all of them before the first is written: a row may be a view of another entry
+        new = []  # all of them before the first is written: a row may be a view of another entry
         for name, row in rows.items():
             target = a[f"memory.{name}"] if name in self.catalog.memory else a[name]
             row = unit_quaternions(self.catalog.mj_model, row) if name == "qpos" else row
-            new[name] = (
-                row.clone() if mask is None else torch.where(by_world(mask, target), row.to(target.dtype), target)
-            )
-        for name, row in new.items():
-            (a[f"memory.{name}"] if name in self.catalog.memory else a[name]).copy_(row)
+            row = row.clone() if mask is None else torch.where(by_world(mask, target), row.to(target.dtype), target)
+            new.append((target, row))
+        for target, row in new:
+            target.copy_(row)
 
 
 CRITIC = "privileged"  # group of the observation that the critic alone sees: it has no noise
