@@ -134,6 +134,14 @@ def check_fields(config: Any) -> None:
             object.__setattr__(config, field.name, check(field.name, value, *interval))
 
 
+def number_of(text: str) -> float | None:
+    """Returns the number that a text is, ``None`` if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
 def check_multiple(name: str, value: float, base_name: str, base: float) -> int:
     """Returns ``value / base`` as a whole number."""
     ratio = round(value / base)

@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import check_bool, check_float, suggestion
+from torchrl_loco.checks import check_bool, check_float, number_of, suggestion
 from torchrl_loco.storage import replace_file
 
 SUFFIXES = (".csv", ".npz")  # of files that motions are read from
@@ -107,7 +107,8 @@ class Motion:
             numbered = [(number, line) for number, line in enumerate(text, start=1) if line.strip()]
         except UnicodeDecodeError as error:
             raise ValueError(f"{self.path} is no text: {error}") from None
-        if numbered and _numbers(numbered[0][1]).count(None) * 2 > numbered[0][1].count(","):
+        head = numbered[0][1].split(",") if numbered else []
+        if numbered and sum(number_of(word) is None for word in head) * 2 >= len(head):
             names = [name.strip().strip('"') for name in numbered.pop(0)[1].split(",")]
             self._joints = names[7:]
             axes = [_axis(name) for name in names[:7]]
@@ -124,10 +125,10 @@ class Motion:
         except ValueError:
             widths = sorted({line.count(",") + 1 for line in lines})
             wrong = [
-                f"{line.split(',')[column]!r} in line {number}, column {column + 1}"
+                f"{word!r} in line {number}, column {column}"
                 for number, line in numbered
-                for column, value in enumerate(_numbers(line))
-                if value is None
+                for column, word in enumerate(line.split(","), start=1)
+                if number_of(word) is None
             ]
             what = wrong[0] if wrong else f"rows of {widths[0]} to {widths[-1]} numbers"
             raise ValueError(f"{self.path} must have rows of as many numbers, it has {what}") from None
@@ -292,17 +293,6 @@ def _axis(column: str) -> str:
     words = re.findall(r"[a-z]+", re.sub(r"[\[(].*", "", column.lower()))
     named = [word.removeprefix("q") for word in words if word.removeprefix("q") in AXES]
     return AXES[named[-1]] if named else AXES.get("".join(words)[-1:], "")
-
-
-def _numbers(line: str) -> list[float | None]:
-    """Returns the numbers of a row, ``None`` for what is none."""
-    found: list[float | None] = []
-    for word in line.split(","):
-        try:
-            found.append(float(word))
-        except ValueError:
-            found.append(None)
-    return found
 
 
 def read(motion: Any, fps: float = 0.0) -> list[Motion]:

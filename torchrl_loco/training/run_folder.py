@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from torchrl_loco import known_files, storage
-from torchrl_loco.checks import check_device, check_run
+from torchrl_loco.checks import check_device, check_run, number_of
 from torchrl_loco.envs.task import folder_of
 from torchrl_loco.policy import Policy, in_task
 from torchrl_loco.registry import resolve
@@ -51,19 +51,11 @@ def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
         count = len(columns) + len(longer[0][None])
         raise ValueError(f"{path} has a line of {count} columns, but its head names {len(columns)}")
     found = [row for row in found if None not in row.values()]
-    wrong = [value for row in found for value in row.values() if value and not _is_number(value)]
+    wrong = [value for row in found for value in row.values() if value and number_of(value) is None]
     if wrong or (columns and "frames" not in columns):
         what = f"{wrong[0]!r} is no number" if wrong else f"its head is {','.join(columns)[:60]!r}"
         raise ValueError(f"{path} is damaged, {what}: mend it, or move it away")
     return columns, found
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
