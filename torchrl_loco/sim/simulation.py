@@ -150,17 +150,11 @@ class Simulation:
         self._kernels = WorldKernels()
         self._scratch = ScratchPool(self.device) if self.device.is_cuda else None
 
-        self.qpos = wp.to_torch(self.data.qpos)
-        self.qvel = wp.to_torch(self.data.qvel)
-        self.ctrl = wp.to_torch(self.data.ctrl)
-        self.qacc_warmstart = wp.to_torch(self.data.qacc_warmstart)
-        self.act = wp.to_torch(self.data.act) if mj_model.na else torch.empty((num_envs, 0), device=device)
-        self.xpos = wp.to_torch(self.data.xpos)
-        self.xmat = wp.to_torch(self.data.xmat)
-        self.time = wp.to_torch(self.data.time)
-        self.overflow = wp.to_torch(self.data.overflow)
-        no_numbers = torch.empty((num_envs, 0), device=device)
-        self.numbers = no_numbers if differing is None else wp.to_torch(self.engine.numbers)
+        d, none = self.data, torch.empty((num_envs, 0), device=device)
+        self.qpos, self.qvel, self.qacc_warmstart = map(wp.to_torch, (d.qpos, d.qvel, d.qacc_warmstart))
+        self.act, self.ctrl = wp.to_torch(d.act) if mj_model.na else none, wp.to_torch(d.ctrl)
+        self.xpos, self.xmat, self.time, self.overflow = map(wp.to_torch, (d.xpos, d.xmat, d.time, d.overflow))
+        self.numbers = none if differing is None else wp.to_torch(self.engine.numbers)
         self.contact_force_history = torch.empty((num_envs, rows, 0, 3), device=device)
         self.in_contact_history = torch.empty((num_envs, rows, 0), dtype=torch.bool, device=device)
         if geoms:
@@ -297,9 +291,8 @@ def set_options(mj_model: mujoco.MjModel, config: SimConfig) -> None:
     option.iterations = config.iterations
     option.ls_iterations = config.ls_iterations
     euler_damping = int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-    option.disableflags = (
-        option.disableflags & ~euler_damping if config.euler_damping else option.disableflags | euler_damping
-    )
+    option.disableflags &= ~euler_damping
+    option.disableflags |= 0 if config.euler_damping else euler_damping
 
 
 def integrator(config: SimConfig) -> int:
