@@ -322,14 +322,10 @@ class Eye:
             self._view.width, self._view.height, self._view.far = width, height, far
             tiles = across, down, times = TILES["cuda" if device.is_cuda else "cpu"]
             self._threads = worlds, math.ceil(width / across) * across * math.ceil(height / (down * times)) * down
-            asked = (kind in kinds for kind in KINDS)
+            asked = [kind in kinds for kind in KINDS]
             self._trace = tracer(*asked, shadows, self.placed.has_meshes, samples, tiles)
-
-            def pixels(kind: str, dtype: Any) -> Buffer:
-                kept = keeps and kind in kinds
-                return Buffer((worlds, height, width) if kept else (0, 0, 0), dtype, device)
-
-            self._out = [pixels(*one) for one in zip(KINDS, (Color, float, int), strict=True)]
+            shapes = [(worlds, height, width) if keeps and told else (0, 0, 0) for told in asked]
+            self._out = [Buffer(shape, kind, device) for shape, kind in zip(shapes, (Color, float, int), strict=True)]
         self.rgb, self.depth, self.geoms = (one.torch for one in self._out)
 
     def launch(self, xpos: wp.array, xmat: wp.array, mask: wp.array | None = None) -> None:
