@@ -70,8 +70,7 @@ def load(path: Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]
         kept = metadata.pop("sha256", None)  # early files have none
         if kept not in (None, _sha256(tensors, metadata)):
             raise ValueError("it is damaged, as its checksum says")
-        settings = {name: value for name, value in metadata.items() if name != "format"}
-        return tensors, {name: json.loads(value) for name, value in settings.items()}
+        return tensors, {name: json.loads(value) for name, value in metadata.items() if name != "format"}
     except (SafetensorError, ValueError, RuntimeError, OSError) as error:
         raise ValueError(f"{path} cannot be read as a {kind}: {error}") from error
 
