@@ -14,11 +14,7 @@ from torchrl_loco.sim.corners import axes_of
 
 @wp.kernel(enable_backward=False)
 def cast(
-    sight: Sight,
-    mask: wp.array[bool],
-    directions: wp.array[wp.vec3],
-    far: float,
-    distance_out: wp.array2d[float],
+    sight: Sight, mask: wp.array[bool], directions: wp.array[wp.vec3], far: float, distance_out: wp.array2d[float]
 ):
     world, ray = wp.tid()
     if mask and not mask[world]:

@@ -404,12 +404,7 @@ class SVGConfig(TrainingConfig):
     widths: ClassVar[tuple[str, ...]] = ("hidden", "model_hidden", "critic_hidden")
     shows_states: ClassVar[bool] = True
     presets: ClassVar[dict[str, Settings]] = {
-        "cpu": {
-            "num_envs": 128,
-            "num_steps": 16,
-            "epochs": 4,
-            "model_hidden": (256, 256),
-        },
+        "cpu": {"num_envs": 128, "num_steps": 16, "epochs": 4, "model_hidden": (256, 256)},
         "cuda": {
             "num_envs": 4096,
             "num_steps": 16,

@@ -144,12 +144,7 @@ class REPPO(Algorithm):
         return [loss, aux, minibatch["returns"].mean(), grad_norm]
 
     def _critic_losses(
-        self,
-        observation: Tensor,
-        action: Tensor,
-        returns: Tensor,
-        features: Tensor,
-        alive: Tensor,
+        self, observation: Tensor, action: Tensor, returns: Tensor, features: Tensor, alive: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
         logits, predicted = self.critic(observation, action)

@@ -256,12 +256,7 @@ class SVG(Algorithm):
         return config.reward_scale * earned.reward, earned.terminated, cut, seen
 
     def _dreamt(
-        self,
-        observation: Tensor,
-        qpos: Tensor,
-        qvel: Tensor,
-        noise: Tensor,
-        *rest: Tensor,
+        self, observation: Tensor, qpos: Tensor, qvel: Tensor, noise: Tensor, *rest: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the actions that standard normal noise makes, and the positions and velocities they lead to."""
         action = self._mean(self.norms["observation"](observation)).float() + self.config.init_std * noise

@@ -11,13 +11,7 @@ import numpy as np
 
 from torchrl_loco.sim.compiled.collision.ground import BOX_NUMBERS
 from torchrl_loco.sim.compiled.collision.kinds import MESH, POINT_BITS, SHAPES, SOLID
-from torchrl_loco.sim.compiled.collision.pairs import (
-    Pair,
-    contact_weight,
-    half_length,
-    impratio,
-    least_regularisation,
-)
+from torchrl_loco.sim.compiled.collision.pairs import Pair, contact_weight, half_length, impratio, least_regularisation
 from torchrl_loco.sim.compiled.collision.planes import LEAST_ALIGNED
 from torchrl_loco.sim.compiled.ir import symbols
 from torchrl_loco.sim.compiled.ir.parameters import Number, VariedModel, nominal, positive, present, varies
