@@ -522,8 +522,9 @@ class Trainer:
         if set(terms) != set(self._terms) and distributed.is_first():
             names = [", ".join(each) or "none" for each in (terms, self._terms)]
             logging.getLogger("torchrl_loco").warning("terms of the reward: %s so far, %s from here on", *names)
-        rank = distributed.rank()
-        before = 1 + len(checkpoint.get("further_ranks", ()))  # a checkpoint without is of one process
+        of_ranks = [checkpoint, *checkpoint.get("further_ranks", ())]  # a checkpoint without is of one process
+        rank, before = distributed.rank(), len(of_ranks)
+        own = of_ranks[rank % before]
         kind = "cpu" if checkpoint["cuda_rng"] is None else "cuda"
         same_ranks, same_kind = before == distributed.ranks(), kind == self.algorithm.device.type
         same = {} if same_ranks and same_kind else {"draws": False}  # which a user's algorithm may not take
@@ -545,11 +546,9 @@ class Trainer:
         if not same_ranks:
             self._say_what_changes(before)
             self.episodes.load_state_dict(checkpoint["episodes"], running=False)
-            learnt = (checkpoint, *checkpoint.get("further_ranks", ()))[rank % before]
-            self.collector.load_state_dict({"transforms": learnt["collector"].get("transforms", {})})
+            self.collector.load_state_dict({"transforms": own["collector"].get("transforms", {})})
             set_stage(self._base, checkpoint.get("stage", {}))
             return
-        own = checkpoint if rank == 0 else checkpoint["further_ranks"][rank - 1]
         self.collector.load_state_dict(own["collector"])
         self.episodes.load_state_dict(own["episodes"], running=True)
         torch.set_rng_state(own["rng"].cpu())
