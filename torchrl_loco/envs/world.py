@@ -81,10 +81,8 @@ class World:
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device. The caller's autocast is for the caller's own networks.
         with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
-            asked: dict[str, Any] = {}
-            if hooks.catalog.contact_geoms:
-                asked["contact_geoms"] = hooks.catalog.contact_geoms
-                asked["contact_history"] = not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
+            geoms, history = hooks.catalog.contact_geoms, not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
+            asked: dict[str, Any] = {"contact_geoms": geoms, "contact_history": history}
             varied = task.variation.varied if task.variation else None
             self.sim = Simulation(mj_model, task.config, n, task.device, varied=varied, **asked)
             nominal = self.sim.numbers.clone()
