@@ -136,11 +136,8 @@ class Model(ReadOnly):
     """
 
     def __init__(self, m: mujoco.MjModel, device: wp.Device) -> None:
-        arrays = {
-            "qpos0": wp.array(m.qpos0.reshape(1, m.nq), dtype=wp.float32, device=device),
-            "jnt_range": wp.array(m.jnt_range.reshape(1, m.njnt, 2), dtype=wp.vec2, device=device),
-            "actuator_ctrlrange": wp.array(m.actuator_ctrlrange.reshape(1, m.nu, 2), dtype=wp.vec2, device=device),
-        }
+        kinds = {"qpos0": wp.float32, "jnt_range": wp.vec2, "actuator_ctrlrange": wp.vec2}
+        arrays = {name: wp.array(getattr(m, name)[None], dtype=kind, device=device) for name, kind in kinds.items()}
         self.__dict__.update({name: read_only(array) for name, array in arrays.items()}, _mj_model=m, _device=device)
 
     @functools.cached_property
