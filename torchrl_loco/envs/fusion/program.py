@@ -326,9 +326,8 @@ class Program:
 
     def _call(self, node: torch.fx.Node, found: dict[torch.fx.Node, Any]) -> Any:
         target: Any = node.target
-        args: Any
-        kwargs: Any
-        args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda arg: found[arg])
+        given: Any = torch.fx.node.map_arg((node.args, node.kwargs), lambda arg: found[arg])
+        args, kwargs = given
         if target is operator.getitem:
             return args[0][args[1]]
         name, self._meta = target._schema.name.split("::")[-1], node.meta.get("val")  # of one in place, it ends with _
