@@ -176,14 +176,13 @@ def check(mj_model: mujoco.MjModel, *, own_control: bool = False) -> mujoco.MjMo
         wrong.append("delays and intervals of sensors are not supported: they are not part of the state that is reset")
     if mj_model.nplastic:
         wrong.append("plastic joints are not supported: their deformation is not part of the state that is reset")
-    losses = mj_model.dof_frictionloss, mj_model.tendon_frictionloss
-    if any((loss < 0).any() for loss in losses):
+    if (mj_model.dof_frictionloss < 0).any() or (mj_model.tendon_frictionloss < 0).any():
         wrong.append("frictionloss must not be negative: C MuJoCo would drive the joint by it, other engines ignore it")
     disabled = {group for group in range(31) if mj_model.opt.disableactuator >> group & 1}
     if disabled.intersection(mj_model.actuator_group.tolist()):
         wrong.append("groups of actuators cannot be disabled (actuatorgroupdisable): leave the actuators out")
+    camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
     for i in range(mj_model.nsensor):
-        camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
         of_camera = camera in (mj_model.sensor_objtype[i], mj_model.sensor_reftype[i])
         if of_camera or mj_model.sensor_type[i] not in VELOCITY_SENSORS | FORCE_SENSORS:
             name = mj_model.sensor(i).name
