@@ -174,6 +174,12 @@ class Calm(WalkerStand):
 
 class Windy(Calm):
     wind = True
+
+class Named(WalkerStand):
+    options = {"speed": (0.5, "m/s"), "names": ((), "Files.")}
+
+class Whole(Named):
+    speed, names = 1, ["a.csv", "b.csv"]
 """
 
 
@@ -183,7 +189,9 @@ def test_an_option_has_the_value_of_the_class_and_errors_in_a_hook_have_a_place(
     file.write_text(TASK)
     for name, blows in (("Calm", False), ("Windy", True)):
         resolve(f"{file}:{name}", by_user=True)
-        assert _of_task(f"{file}:{name}")["wind"][0] == blows
+        assert _of_task(f"{file}:{name}")["wind"][:2] == (False, blows)
+    resolve(f"{file}:Whole", by_user=True)
+    assert [entry[1] for entry in _of_task(f"{file}:Whole").values()] == [1.0, ("a.csv", "b.csv")]
     with pytest.raises(SystemExit):
         cli.main(["train", f"{file}:Windy", "--device", "cpu", "--no_wind", "--out", str(tmp_path)])
     assert f"({file}, line 9, in reward)" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from torchrl.modules import SafeProbabilisticModule
 
 from torchrl_loco.checks import ANY, Interval, check_int
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.envs.state import State, without_state
+from torchrl_loco.envs.state import State
 from torchrl_loco.envs.transforms import PLAIN_TRANSFORMS, load_transforms, state_of_transforms, unwrap
 from torchrl_loco.sim import TorchGraph
 
@@ -226,10 +226,12 @@ class RolloutCollector:
                 raise ValueError(f"the state is of {worlds[0]} worlds from {worlds[1]} on, not {own[0]} from {own[1]}")
             size, device = self._env.batch_size, self._env.device
             returned = self._env.reset(State(state["env"], batch_size=size, device=device), set_state=True)
-            begin = without_state(returned, device)  # TorchRL's TransformedEnv returns it too
-            assert begin is not None
+            of_env = {*self._env.observation_spec.keys(), *self._env.state_spec.keys()}
+            stale = set(State.KEYS) - of_env  # which TorchRL's TransformedEnv returns, and collectors once kept
+            begin = TensorDict({k: v for k, v in returned.items() if k not in stale}, batch_size=size, device=device)
             carried = TensorDict(state["carried"], batch_size=size, device=device)
-            kept = carried.select(*begin.keys(True, True), *state.get("remembered", ()), strict=False)
+            remembered = set(state.get("remembered", ())) - (stale if "qpos" in carried else set())
+            kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
             self._carried = begin.update(kept)
             if "seed" in state:  # on which later episodes depend
                 self._base._continue_with(state["seed"])

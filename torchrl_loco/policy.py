@@ -89,11 +89,11 @@ def in_task(info: Mapping[str, Any], trained: str, task: str) -> dict[str, Any]:
 
     Nor are there options of the training that the other task lacks.
     """
-    if task.rpartition(":")[2] == trained.rpartition(":")[2]:
+    here, there = (name.rpartition(":")[2].partition("~")[0] for name in (task, trained))
+    if here == there or (cls := resolve(task)).__qualname__ == there:  # of an id, the class may have been named
         return {**info, "task": task}
     kept = {name: value for name, value in info.items() if name not in EARNED}
-    own = resolve(task).options if "options" in kept else {}
-    options = {name: value for name, value in kept.pop("options", {}).items() if name in own}
+    options = {name: value for name, value in kept.pop("options", {}).items() if name in cls.options}
     return {**kept, "task": task, **({"options": options} if options else {})}
 
 

@@ -20,7 +20,6 @@ from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.view import View
-from torchrl_loco.training.environments import content_of
 
 SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
 CONFIG = SimConfig(ctrl_dt=0.02, sim_dt=0.005, iterations=20, ls_iterations=20, euler_damping=True)
@@ -860,12 +859,6 @@ def test_metrics_may_be_none():
 
     env = Silent(2, "cpu", 0, metrics=True, on_overflow="ignore")
     assert env.rollout(2).shape == (2, 2)
-
-
-def test_options_that_change_a_run_change_its_content():
-    """As a file does that is edited: its best policy was selected by other returns."""
-    contents = [content_of("falling", Falling(1, "cpu", 0, height=height)) for height in (1.0, 2.0, 2.0)]
-    assert contents[0] != contents[1] == contents[2]
 
 
 def test_options_are_arguments_attributes_and_part_of_a_run(tmp_path):

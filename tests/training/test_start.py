@@ -219,7 +219,7 @@ def test_what_an_edit_changes_is_noticed(tmp_path):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     frames = {"place": torch.zeros(3, 2)}
-    env = SimpleNamespace(hooks=SimpleNamespace(catalog=SimpleNamespace(constants=frames)), options={})
+    env = SimpleNamespace(hooks=SimpleNamespace(catalog=SimpleNamespace(constants=frames)))
 
     def content():
         known_files.remember(tmp_path / "task.py")
@@ -531,3 +531,22 @@ def test_a_script_that_is_read_for_its_class_does_not_train_again(tmp_path, monk
     with pytest.raises(RuntimeError, match="would train again: put what it does"):
         train("walker_walk", out=tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
+
+
+def test_an_option_that_is_edited_selects_the_best_policy_anew(tmp_path, capsys):
+    """What was earned before is of another reward; a number is the same however it is written."""
+    file = tmp_path / "task.py"
+    file.write_text(
+        "import torchrl_loco\nclass Paid(torchrl_loco.WalkerStand):\n    options = {'bonus': (0.0, 'For each step.')}\n"
+        "    def reward(self, s):\n        return s.qpos[:, 1] + self.bonus\n"
+    )
+    run = train(f"{file}:Paid", device="cpu", bonus=5, out=tmp_path / "runs", **SMALL)
+    capsys.readouterr()
+    for bonus, frames, said in ((5.0, 1000, False), (1.0, 2000, True)):
+        settings = json.loads((run.path / "config.json").read_text())
+        settings["options"]["bonus"] = bonus
+        (run.path / "config.json").write_text(json.dumps(settings))
+        total = run.load_config().total_frames + frames
+        train(f"{file}:Paid", resume=run.path, total_frames=total)
+        assert ("was edited since" in capsys.readouterr().err) == said
+    assert run.load_policy("cpu").info["selected_by"] < 2000

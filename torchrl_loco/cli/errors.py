@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import site
 import sys
 import sysconfig
 import traceback
@@ -50,8 +51,9 @@ def tolerate_broken_streams() -> None:
 def _place_of(error: Exception) -> str:
     """Returns where an error was raised if that is in a file of the user's own, such as that of a task."""
     raised = traceback.extract_tb(error.__traceback__)[-1]
-    theirs = (str(PACKAGE), *(sysconfig.get_path(kind) for kind in ("stdlib", "platlib", "purelib")))
-    if raised.filename.startswith((*theirs, "<")):
+    places = [sysconfig.get_paths()[kind] for kind in ("stdlib", "platlib", "purelib")]
+    theirs = [str(PACKAGE), site.getusersitepackages(), *places]
+    if raised.filename.startswith("<") or any(Path(raised.filename).is_relative_to(each) for each in theirs):
         return ""
     return f" ({raised.filename}, line {raised.lineno}, in {raised.name})"
 

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -115,21 +116,36 @@ def _options(config: TrainingConfig) -> TrainingConfig:
     kind = type(config)
     fields: list[Any] = [("task", Annotated[str, *hidden], config.task), ("seeds", SEEDS, ()), ("gpus", GPUS, None)]
     fields.append(("options", Annotated[dict[str, Any], *hidden], dataclasses.field(default_factory=dict)))
-    fields += [(name, _annotated(value, words), value) for name, (value, words) in _of_task(config.task).items()]
+    own = _of_task(config.task)
+    fields += [(name, _annotated(declared, words), value) for name, (declared, value, words) in own.items()]
     cls = dataclasses.make_dataclass(kind.__name__, fields, bases=(kind,), frozen=True)
     return cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
 
 
-def _of_task(task: str) -> Mapping[str, tuple[Any, str]]:
-    """Returns the options of a task, with the values that its class has; it is imported only if it has any."""
+def _of_task(task: str) -> Mapping[str, tuple[Any, Any, str]]:
+    """Returns the options of a task: what is declared, the value of its class, and words.
+
+    It is imported only if it has any.
+    """
     found = tasks.found().get(task)
     if found is not None and not found.has_options:
         return {}
     cls = resolve(task)
     from torchrl_loco.envs.task import options_of_class  # with torch, as the class is
 
-    values = options_of_class(cls)
-    return {name: (values.get(name, value), words) for name, (value, words) in cls.options.items()}
+    own = options_of_class(cls)
+    return {name: (value, _of_kind(value, own.get(name, value)), words) for name, (value, words) in cls.options.items()}
+
+
+def _of_kind(declared: Any, value: Any) -> Any:
+    """Returns a value as one of the kind that is declared, and what is declared if it is none, such as an object."""
+    several = isinstance(declared, tuple)
+    kind: Any = type((*declared, "")[0] if several else declared)
+    parts = list(value) if isinstance(value, tuple | list) else [value]
+    taken = {float: (int, float), str: (str, Path)}.get(kind, kind)
+    if not all(isinstance(part, taken) for part in parts) or not (several or len(parts) == 1):
+        return declared
+    return tuple(map(kind, parts)) if several else kind(parts[0])
 
 
 def _annotated(value: Any, words: str) -> Any:
@@ -159,7 +175,7 @@ def settings(options: Any) -> tuple[TrainingConfig, tuple[int, ...], int | None]
     """Returns the settings, the seeds and the number of GPUs of what :func:`_options` returned."""
     (kind,) = type(options).__bases__
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(kind)}
-    asked = {name: (getattr(options, name), value) for name, (value, _) in _of_task(options.task).items()}
+    asked = {name: (getattr(options, name), value) for name, (_, value, _) in _of_task(options.task).items()}
     if given := {name: value for name, (value, default) in asked.items() if value != default}:
         values["options"] = resolve(options.task).checked_options(given)
     return kind(**values), options.seeds, options.gpus

@@ -21,7 +21,7 @@ class ActionRepeat(FrameSkipTransform):
 
     TorchRL's FrameSkipTransform goes on stepping a world whose episode has ended, and loses the end and the true
     terminal observation. Until the action ends such a world is stepped on here, too, unseen: ``adapt`` and ``health()``
-    count its end more than once.
+    count its end more than once. ``RewardSum`` belongs behind it.
     """
 
     _checked = False
@@ -30,10 +30,12 @@ class ActionRepeat(FrameSkipTransform):
         super().__init__(check_int("frame_skip", frame_skip))
 
     def _check(self, parent: Any) -> None:
-        """Checks what lies below: a ``RewardSum`` there would see the last control step of an action alone."""
+        """Warns of what lies below and goes wrong."""
         self._checked = True
         if any(isinstance(transform, t.RewardSum) for transform in named_transforms(parent).values()):
-            raise ValueError("RewardSum must come after ActionRepeat, whose rewards it is to sum")
+            logging.getLogger("torchrl_loco").warning(
+                "RewardSum sums the last control step of each action alone: it belongs behind ActionRepeat"
+            )
         if "adapt" in getattr(unwrap(parent)[0].hooks, "own", ()):
             logging.getLogger("torchrl_loco").warning(
                 "adapt() counts an episode that ends within an action of ActionRepeat more than once: pass a longer "
@@ -157,12 +159,15 @@ class TransformedEnv(TorchRLTransformedEnv):
         super().load_state_dict(of_transforms, strict=strict, **kwargs)
         self.base_env.load_state_dict({name.removeprefix(BASE): value for name, value in of_env.items()}, strict=strict)
 
-    def view(self, policy: Callable[[TensorDictBase], TensorDictBase], **settings: Any) -> Any:
+    def view(
+        self, policy: Callable[[TensorDictBase], TensorDictBase], action_repeat: int | None = None, **server: Any
+    ) -> Any:
         """Plays a policy, which reads what the transforms make, in the browser.
 
         Args:
             policy: reads what the transforms return.
-            settings: further ones of :meth:`LocoEnv.view`.
+            action_repeat: as for :meth:`LocoEnv.view`.
+            server: as for it, too.
 
         Returns:
             The viewer.
@@ -172,7 +177,7 @@ class TransformedEnv(TorchRLTransformedEnv):
         """
         if any(isinstance(transform, FrameSkipTransform) for transform in named_transforms(self).values()):
             raise ValueError("view holds actions itself: leave ActionRepeat out, and pass action_repeat")
-        return type(unwrap(self)[0]).view(self, policy, **settings)
+        return type(unwrap(self)[0]).view(self, policy, action_repeat, **server)
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns what ``step_mdp`` makes of a step, with new episodes in the worlds that were done."""

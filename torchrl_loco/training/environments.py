@@ -226,9 +226,6 @@ def content_of(task: str, env: LocoEnv) -> str:
         model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
         mujoco.mj_saveModel(env.mj_model, None, model)
         digest.update(model.data)
-    for name, (value, _) in env.options.items():
-        if isinstance(value, int | float) and getattr(env, name) != value:  # the places of files say nothing
-            digest.update(f"{name} {getattr(env, name)}".encode())
     assert env.hooks is not None
     for table in env.hooks.catalog.constants.values():
         digest.update(table.cpu().numpy().tobytes())

@@ -461,6 +461,7 @@ class Trainer:
                 "settings": self._identity(),
                 "cases": list(self._base.cases().items()),
                 "content": self._content,
+                "options": _numbers_of(self.config.options),
                 "spaces": dataclasses.asdict(self.algorithm.spaces),
                 "algorithm": self.algorithm.state_dict(),
                 "trials": self.trials.state_dict(),
@@ -512,6 +513,8 @@ class Trainer:
                 f"{self.run.path} is a run of {len(old)} case(s), {of[0]}, and not of {len(cases)}, {of[1]}: train "
                 "anew, with its weights by --init"
             )
+        options = _numbers_of(self.config.options)
+        was_edited |= checkpoint.get("options", options) != options
         if was_edited and distributed.is_first():
             print(
                 f"{self.run.task} (a file or option of it, its model or a motion) was edited since the checkpoint: the "
@@ -578,3 +581,9 @@ class Trainer:
 def _rounded(value: float) -> str:
     """Returns a number with three digits or more."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def _numbers_of(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns options but those of text, such as places of files: what these hold is in the content of a run."""
+    lists = {name: list(value) if isinstance(value, tuple | list) else [value] for name, value in options.items()}
+    return {name: parts for name, parts in lists.items() if not any(isinstance(part, str) for part in parts)}

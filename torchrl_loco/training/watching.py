@@ -1,11 +1,12 @@
 """A run that may still be training, seen from another process: its files are read, and nothing else."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 from torchrl_loco.checks import check_device
 from torchrl_loco.envs.access import set_stage
-from torchrl_loco.policy import Policy
+from torchrl_loco.policy import Policy, in_task
 from torchrl_loco.registry import make, resolve
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.environments import refuse_transforms
@@ -23,6 +24,8 @@ class Watched:
 
     def __init__(self, run: RunFolder, num_envs: int, device: str, seed: int) -> None:
         self._run, self._device, config = run, device, run.load_config(device=device)
+        here = in_task({"options": config.options}, config.task, run.task).get("options", {})
+        config = dataclasses.replace(config, options=here)
         settings = {**config.of_env, "world_offset": 0, "reward_terms": True, "play": True}
         self.env = make(resolve(run.task), num_envs, device, seed, config.protocol, **settings)
         self._files = [run.policy] if run.given else [run.policy, run.checkpoint]
@@ -57,4 +60,6 @@ def last_policy(run: RunFolder, device: str | None = None, path: Path | None = N
     algorithm.load_networks(checkpoint["algorithm"]["networks"])
     names = "frames", "seconds", "stage", "full_length", "transforms"
     counters: dict[str, Any] = {name: checkpoint[name] for name in names if name in checkpoint}
-    return deterministic_policy(algorithm.actor, config, counters)
+    policy = deterministic_policy(algorithm.actor, config, counters)
+    policy.info = in_task(policy.info, run.load_config().task, run.task)
+    return policy
