@@ -230,7 +230,8 @@ class RolloutCollector:
             stale = set(State.KEYS) - of_env  # which TorchRL's TransformedEnv returns, and collectors once kept
             begin = TensorDict({k: v for k, v in returned.items() if k not in stale}, batch_size=size, device=device)
             carried = TensorDict(state["carried"], batch_size=size, device=device)
-            remembered = set(state.get("remembered", ())) - (stale if "qpos" in carried else set())
+            dropped = stale if "qpos" in carried else set()
+            remembered = [name for name in state.get("remembered", ()) if name not in dropped]
             kept = carried.select(*begin.keys(True, True), *remembered, strict=False)
             self._carried = begin.update(kept)
             if "seed" in state:  # on which later episodes depend
