@@ -51,9 +51,9 @@ def tolerate_broken_streams() -> None:
 def _place_of(error: Exception) -> str:
     """Returns where an error was raised if that is in a file of the user's own, such as that of a task."""
     raised = traceback.extract_tb(error.__traceback__)[-1]
-    places = [sysconfig.get_paths()[kind] for kind in ("stdlib", "platlib", "purelib")]
-    theirs = [str(PACKAGE), site.getusersitepackages(), *places]
-    if raised.filename.startswith("<") or any(Path(raised.filename).is_relative_to(each) for each in theirs):
+    paths = sysconfig.get_paths()
+    of_others = [str(PACKAGE), site.getusersitepackages(), paths["stdlib"], paths["platlib"], paths["purelib"]]
+    if raised.filename.startswith("<") or any(Path(raised.filename).is_relative_to(each) for each in of_others):
         return ""
     return f" ({raised.filename}, line {raised.lineno}, in {raised.name})"
 

@@ -15,10 +15,10 @@ from torchrl_loco.training import distributed
 
 ALIGNED = 16
 """Numbers at a multiple of which each parameter and each row of a matrix begins: products of matrices in bfloat16 read
-16 bytes at a time, which Triton does where it sees multiples of 16."""
+16 bytes at a time, in Triton only where the stride of rows is a multiple of 16 numbers."""
 
 SMALL, LARGE = 64, 256
-"""Threads of a block: few, so that all multiprocessors have some of a thread for each step or world, and many."""
+"""Threads of a block: few in kernels with a thread for each step or world, so that all multiprocessors get blocks."""
 
 
 class FlatAdam:
@@ -152,8 +152,8 @@ class Vectors:
         self.counts = torch.tensor([0.0, 1.0, 1.0], **doubles)
         self._factors, self._summands = (torch.tensor(x, **doubles) for x in ([1.0, *betas], [1.0, 0.0, 0.0]))
         self._addresses: list[int] = []
-        self._memory: dict[int, Tensor] = {}
-        self._in_use: list[Tensor] = []
+        self._in_parts: Tensor | None = None
+        self._has_parts = False  # since the gradients were forgotten
         self.adopt()
 
     @torch.no_grad()
@@ -199,8 +199,9 @@ class Vectors:
 
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
-        given = [parts.detach().sum(0) for parts in self._in_use]
-        given += [] if self.whole.grad is None else [self.whole.grad]
+        given = [] if self.whole.grad is None else [self.whole.grad]
+        if self._in_parts is not None and self._has_parts:
+            given.append(self._in_parts.detach().sum(0))
         gradient = functools.reduce(torch.add, given) if given else torch.zeros_like(self.whole)
         own = [(part.grad, view) for part, view in zip(self._parts, self._views(gradient), strict=True)]
         found = [(of_part, view) for of_part, view in own if of_part is not None]
@@ -210,14 +211,14 @@ class Vectors:
 
     def in_parts(self, count: int) -> Tensor:
         """Returns memory for parts of the gradient, of which it takes the sum."""
-        if count not in self._memory:
-            self._memory[count] = self.whole.new_zeros(count, len(self.whole), requires_grad=True)
-        self._in_use = [self._memory[count]]
-        return self._memory[count]
+        if self._in_parts is None:
+            self._in_parts = self.whole.new_zeros(count, len(self.whole), requires_grad=True)
+        self._has_parts = True
+        return self._in_parts
 
     def forget_gradients(self) -> None:
         """Forgets them."""
-        self._in_use = []
+        self._has_parts = False
         for part in (self.whole, *self._parts):
             part.grad = None
 

@@ -343,7 +343,7 @@ class Packed:
             size = entry[0].numel() * entry.element_size()
             self._entries.append((key, slice(end, end + size), entry.dtype, entry.shape[1:]))
             end += -(-size // ROW_ALIGNED) * ROW_ALIGNED
-        end += end % (2 * ROW_ALIGNED)
+        end += -end % (2 * ROW_ALIGNED)
         self._rows = entry.new_zeros(len(steps), end, dtype=torch.uint8)
         self.steps = self._views(self._rows).update_(steps)
 

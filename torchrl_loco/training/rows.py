@@ -113,9 +113,10 @@ def triton_kernels() -> ModuleType:
 
 @functools.cache
 def triton_works(device: torch.device) -> bool:
-    """Returns whether Triton, which comes with torch for Linux, can make kernels for a GPU; if not, a warning says so.
+    """Returns whether Triton can compile kernels for a GPU; a warning says why it cannot.
 
-    Before compute capability 8.0 there are no products in bfloat16, for which torch's kernels are made too.
+    Triton comes with torch for Linux, and needs a compiler of C. GPUs before compute capability 8.0, without tensor
+    cores for bfloat16, keep torch's kernels.
     """
     if torch.cuda.get_device_capability(device) < (8, 0):
         return False
