@@ -99,6 +99,11 @@ class Algorithm(ABC):
         """Returns what a user should know of ``metrics``, by name from one batch or several, or an empty string."""
         return ""
 
+    @classmethod
+    def compiles(cls, config: TrainingConfig) -> bool:
+        """Returns whether torch.compile will be needed on CUDA, which takes seconds to be ready."""
+        return getattr(config, "compile", False)
+
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors."""
         return self.actor

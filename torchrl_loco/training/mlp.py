@@ -4,7 +4,8 @@ As torch computes them, a gradient step of small networks mostly reads and write
 biases are passes of their own over all activations.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -100,20 +101,30 @@ def _by_weights(
 
 def compile_ahead(networks: Iterable[Sequence[Tensor]], n: int, parts: Tensor) -> None:
     """Compiles what networks of such weights need for ``n`` rows, and for their slopes, all kernels at once."""
-    with ThreadPoolExecutor() as pool, torch.cuda.device(parts.device), triton.AsyncCompileMode(pool):
+    with all_at_once(parts.device):
         for weights in networks:
             rows = weights[0].new_empty(n, weights[0].shape[1])
-            _forward_all(rows, weights, keep=False, start=_compile)
-            out, kept = _forward_all(rows, weights, keep=True, start=_compile)
-            _backward_all(out, weights, kept, parts, start=_compile)
+            _forward_all(rows, weights, keep=False, start=compile_only)
+            out, kept = _forward_all(rows, weights, keep=True, start=compile_only)
+            _backward_all(out, weights, kept, parts, start=compile_only)
 
 
-def _compile(kernel: Any, grid: tuple[int, ...], args: Sequence[Any], sizes: Mapping[str, Any]) -> None:
+@contextlib.contextmanager
+def all_at_once(device: torch.device) -> Iterator[None]:
+    """Lets kernels that are compiled within be compiled side by side; they are there at its end."""
+    with ThreadPoolExecutor() as pool, torch.cuda.device(device), triton.AsyncCompileMode(pool):
+        yield
+
+
+def compile_only(kernel: Any, grid: tuple[int, ...], args: Sequence[Any], sizes: Mapping[str, Any]) -> None:
+    """Compiles a kernel for what :func:`run` would launch."""
     kernel.warmup(*args, grid=grid, **sizes)
 
 
-def _run(kernel: Any, grid: tuple[int, ...], args: Sequence[Any], sizes: Mapping[str, Any]) -> None:
-    kernel[grid](*args, **sizes)
+def run(kernel: Any, grid: tuple[int, ...], args: Sequence[Any], sizes: Mapping[str, Any]) -> None:
+    """Launches a kernel on the device of its first argument, on torch's current stream there."""
+    with torch.cuda.device(args[0].device):
+        kernel[grid](*args, **sizes)
 
 
 def _sizes(settings: dict[str, int], k: int, o: int) -> dict[str, int]:
@@ -123,7 +134,7 @@ def _sizes(settings: dict[str, int], k: int, o: int) -> dict[str, int]:
 
 
 def _forward_all(
-    rows: Tensor, weights: Sequence[Tensor], keep: bool, start: Callable[..., None] = _run
+    rows: Tensor, weights: Sequence[Tensor], keep: bool, start: Callable[..., None] = run
 ) -> tuple[Tensor, list[Tensor]]:
     """Returns what a network gives, and what its slopes need: what each layer reads, and SiLU's slope there."""
     n, given, kept = len(rows), rows, [rows]
@@ -142,7 +153,7 @@ def _forward_all(
 
 
 def _backward_all(
-    d: Tensor, weights: Sequence[Tensor], kept: Sequence[Tensor], parts: Tensor, start: Callable[..., None] = _run
+    d: Tensor, weights: Sequence[Tensor], kept: Sequence[Tensor], parts: Tensor, start: Callable[..., None] = run
 ) -> None:
     """Writes the slopes by weights, which are views of a vector, into parts of one; ``d`` are those by the outputs."""
     n, inputs, slopes = len(d), kept[::2], kept[1::2]
@@ -177,8 +188,7 @@ class SiluNetwork(torch.autograd.Function):
                 ``None``: there will be none.
             weights: weights and biases of the layers in turn, views of one vector of that length.
         """
-        with torch.cuda.device(rows.device):
-            out, kept = _forward_all(rows, weights, keep=parts is not None)
+        out, kept = _forward_all(rows, weights, keep=parts is not None)
         ctx.parts, ctx.number = parts, len(weights)
         if parts is not None:
             ctx.save_for_backward(*weights, *kept)
@@ -188,6 +198,5 @@ class SiluNetwork(torch.autograd.Function):
     def backward(ctx: Any, d: Tensor) -> tuple[None, ...]:
         """Writes the slopes by weights."""
         weights, kept = ctx.saved_tensors[: ctx.number], ctx.saved_tensors[ctx.number :]
-        with torch.cuda.device(d.device):
-            _backward_all(d.contiguous(), weights, kept, ctx.parts.detach())
+        _backward_all(d.contiguous(), weights, kept, ctx.parts.detach())
         return (None,) * (2 + ctx.number)

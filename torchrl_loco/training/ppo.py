@@ -65,7 +65,10 @@ class PPO(Algorithm):
         self.critic = ValueOperator(whole, in_keys=[spaces.critic_key]).to(config.device)
         self.networks = nn.ModuleDict({"actor": self.actor, "critic": self.critic})
         self._dtype = torch.bfloat16 if config.bf16 and self.device.type == "cuda" else torch.float32
-        self._mean, self._value = Rows(mean, first, self._dtype), Rows(value, of_critic, self._dtype)
+        self._mean, self._value = (
+            Rows(net, part if isinstance(part, PixelEncoder) else spaces.rows[key], self._dtype)
+            for net, part, key in ((mean, first, spaces.actor_key), (value, of_critic, spaces.critic_key))
+        )
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = self.make_optimizer("actor and critic", parameters)
         self._compile()
@@ -77,7 +80,7 @@ class PPO(Algorithm):
         small = draw_of(*action), loss_of(*action), follow
         self.optimizer.compile_with([(normalise_of(self._dtype), LARGE), *((kernel, SMALL) for kernel in small)])
         if fast := [rows for rows in (self._mean, self._value) if rows.in_triton]:
-            mlp, weights = triton_kernels(), self.optimizer.wide(self._dtype)
+            mlp, weights = triton_kernels("mlp"), self.optimizer.wide(self._dtype)
             parts = self.optimizer.parts(mlp.PARTS).detach()
             mlp.compile_ahead([rows.own(weights) for rows in fast], self.config.minibatch_size, parts)
 

@@ -6,22 +6,28 @@ actor minimises the KL divergence from the policy that collected the data wherev
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, mse_loss
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives.utils import hold_out_net
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.policy import layers_of
+from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of, normed_layers
+from torchrl_loco.training.adam import LARGE, FlatAdam
 from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
-from torchrl_loco.training.config import REPPOConfig
+from torchrl_loco.training.config import REPPOConfig, TrainingConfig
+from torchrl_loco.training.ppo import normalise_of
+from torchrl_loco.training.reppo_rows import ReppoRows
+from torchrl_loco.training.rows import triton_works
 
 
 class REPPO(Algorithm):
@@ -46,7 +52,8 @@ class REPPO(Algorithm):
             layers = [*normed_layers(inputs, config.hidden), head]
         else:
             layers = layers_of(network_of(network, inputs, outputs))
-        whole = nn.Sequential(encoder or self.norms["observation"], *layers, NormalParamExtractor("exp"))
+        extract = NormalParamExtractor("exp")
+        whole = nn.Sequential(encoder or self.norms["observation"], *layers, extract)
         self.actor = make_actor(spaces, config.device, whole, log_prob=False, bound=config.action_bound)
         bins = ValueBins(config.min_value, config.max_value, config.num_bins)
         self.critic = DistributionalQ((spaces.critic, spaces.action), config.hidden, bins, sight).to(config.device)
@@ -60,17 +67,57 @@ class REPPO(Algorithm):
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
-        self._compiled_values = self.fused(self._values, "actor and critic", config.bf16)
-        self._compiled_critic_losses = self.fused(self._critic_losses, "the critic", config.bf16)
-        self._compiled_actor_losses = self.fused(self._actor_losses, "the actor", config.bf16)
+        self._rows: ReppoRows | None = None
+        self._policy: Callable[[Tensor], tuple[Tensor, Tensor]] = self.distribution  # what losses compute with
+        self._q: ReppoRows | DistributionalQ = self.critic
+        if not spaces.pixels and triton_works(self.device):
+            sizes, dtype = (spaces.observation, spaces.critic), torch.bfloat16 if config.bf16 else torch.float32
+            parts = nn.Sequential(*layers), extract, self.critic, sizes, dtype
+            self._rows = self._q = ReppoRows(*parts, config.minibatch_size)
+            self.critic_optimizer.compile_with([(normalise_of(dtype), LARGE)])
+            self._policy = self._rows.distribution
+        self._fused_values = self.fused(self._values, "actor and critic", config.bf16)
+        self._fused_critic_losses = self.fused(self._q.losses, "the critic", config.bf16)
+        self._fused_actor_losses = self.fused(self._actor_losses, "the actor", config.bf16)
+
+    @classmethod
+    def compiles(cls, config: TrainingConfig) -> bool:
+        """Returns whether torch.compile will be needed on CUDA."""
+        return super().compiles(config) and (config.from_pixels or not triton_works(torch.device(config.device)))
+
+    def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:
+        """Returns a function of tensors as kernels of torch.compile, where there are no others."""
+        return function if self._rows else super().fused(function, what, bf16, **options)
 
     def acting(self) -> nn.Module:
-        """Returns the actor as a policy for collectors, compiled on CUDA if the settings ask for that."""
+        """Returns the actor as a policy for collectors, with networks that compute as in gradient steps on CUDA."""
+        if self._rows:
+            return Acting(self.actor, self._act, ("loc", "scale", "action"))
         return Acting(self.actor, self.fused(self.actor, "the actor"))
+
+    @torch.no_grad()
+    def _act(self, td: TensorDictBase) -> TensorDictBase:
+        """Returns ``td`` with actions and the distribution that they were drawn from."""
+        assert self._rows is not None
+        self._rows.take(self.actor_optimizer)
+        key = self.spaces.actor_key
+        loc, scale = self._policy(self._normalised(td[key], self.norms[key]))
+        explores = exploration_type() in (ExplorationType.RANDOM, None)
+        before_tanh = torch.addcmul(loc, scale, torch.randn_like(loc)) if explores else loc
+        return td.update({"loc": loc, "scale": scale, "action": before_tanh.tanh() * self.action_bound})
+
+    def _normalised(self, rows: Tensor, norm: ObservationNorm) -> Tensor:
+        """Returns normalised rows as the networks read them."""
+        return self._rows.normalised(rows, norm) if self._rows else norm(rows)
+
+    def _take(self, *optimizers: FlatAdam) -> None:
+        """Computes with the weights that optimizers have now."""
+        if self._rows:
+            self._rows.take(*optimizers)
 
     def _read(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Returns what networks read of a batch, by entry: rows of numbers normalised, pixels as they are."""
-        rows = {key: norm(td[key]) for key, norm in self.norms.items()}
+        rows = {key: self._normalised(td[key], norm) for key, norm in self.norms.items()}
         return rows | ({"pixels": td["pixels"]} if self.spaces.pixels else {})
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -81,14 +128,15 @@ class REPPO(Algorithm):
         """
         config, after = self.config, batch["next"]
         now, later = self._read(batch), self._read(after)
+        self._take(self.actor_optimizer, self.critic_optimizer)
         noise = torch.randn_like(batch["action"])
         observed = later[self.spaces.actor_key], later[self.spaces.critic_key]
         if self.spaces.pixels:  # step by step: a whole batch would fill the memory with what convolutions give
             steps = zip(*(each.unbind(1) for each in (*observed, noise)), strict=True)
-            parts = [self._compiled_values(*step) for step in steps]
+            parts = [self._fused_values(*step) for step in steps]
             log_prob, value, features = (torch.stack(part, dim=1) for part in zip(*parts, strict=True))
         else:
-            log_prob, value, features = self._compiled_values(*observed, noise)
+            log_prob, value, features = self._fused_values(*observed, noise)
         alive = ~after["terminated"]
         reward = after["reward"] * config.reward_scale
         reward = reward - config.gamma * self.dual.temperature * log_prob.unsqueeze(-1) * alive
@@ -130,26 +178,18 @@ class REPPO(Algorithm):
 
     def _values(self, observation: Tensor, of_critic: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns log-probability, value and features of one action in each state, made of standard normal noise."""
-        loc, scale = self.distribution(observation)
-        action, log_prob = sample(loc, scale, noise)
-        return log_prob, *self.critic.value_and_features(of_critic, action)
+        action, log_prob = self._sample(*self._policy(observation), noise)
+        return log_prob, *self._q.value_and_features(of_critic, action)
 
     def critic_step(self, minibatch: TensorDictBase) -> list[Tensor]:
         """Returns the metrics of the critic, which learns to predict returns and its own features of the next step."""
         names = self.spaces.critic_key, "action", "returns", "features", "alive"
-        loss, aux = self._compiled_critic_losses(*(minibatch[name] for name in names))
+        self._take(self.critic_optimizer)
+        loss, aux = self._fused_critic_losses(*(minibatch[name] for name in names))
         self.critic_optimizer.zero_grad()
         (loss + self.config.aux_coeff * aux).backward()
         grad_norm = clip_and_step(self.critic_optimizer, self.config.max_grad_norm)
         return [loss, aux, minibatch["returns"].mean(), grad_norm]
-
-    def _critic_losses(
-        self, observation: Tensor, action: Tensor, returns: Tensor, features: Tensor, alive: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
-        logits, predicted = self.critic(observation, action)
-        aux = (mse_loss(predicted, features, reduction="none").mean(-1) * alive).mean()
-        return cross_entropy(logits, self.critic.bins.encode(returns)), aux
 
     def actor_step(self, minibatch: TensorDictBase) -> list[Tensor]:
         """Returns the metrics of the actor: it ascends value and entropy near the old policy, and goes back to it."""
@@ -157,7 +197,8 @@ class REPPO(Algorithm):
         names = self.spaces.critic_key, "loc", "scale"
         noise, observation = torch.randn_like(minibatch["loc"]), self.observed(minibatch)
         with hold_out_net(self.critic):  # gradients pass through it, but not to its parameters
-            loss, entropy, divergence, exceeded = self._compiled_actor_losses(
+            self._take(self.actor_optimizer, self.critic_optimizer)
+            loss, entropy, divergence, exceeded = self._fused_actor_losses(
                 observation, *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
             )
         # The dual variables rise while their constraint is violated: too little entropy, too much divergence.
@@ -183,13 +224,15 @@ class REPPO(Algorithm):
 
         All are scalars, of ``n`` steps; the last one is a fraction of them.
         """
-        loc, scale = self.distribution(observation)
-        action, log_prob = sample(loc, scale, noise)
-        value, _ = self.critic.value_and_features(of_critic, action)
-        divergence = kl(old_loc, old_scale, loc, scale)
-        exceeded = divergence >= self.config.kl_bound
-        loss = torch.where(exceeded, kl_weight * divergence, temperature * log_prob - value).mean()
-        return loss, -log_prob.detach().mean(), divergence.detach().mean(), exceeded.float().mean()
+        own = self._policy(observation)
+        action, log_prob = self._sample(*own, noise)
+        value, _ = self._q.value_and_features(of_critic, action)
+        losses = self._rows.actor_losses if self._rows else actor_losses
+        return losses(own, (old_loc, old_scale), log_prob, value, (temperature, kl_weight), self.config.kl_bound)
+
+    def _sample(self, loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns actions and their log-probabilities, as :func:`sample` does."""
+        return self._rows.sample(loc, scale, noise) if self._rows else sample(loc, scale, noise)
 
 
 class DualVariables(nn.Module):
@@ -239,6 +282,33 @@ def kl(old_loc: Tensor, old_scale: Tensor, loc: Tensor, scale: Tensor) -> Tensor
     return (0.5 * (ratio.square() + distance.square() - 1.0) - ratio.log()).sum(-1)
 
 
+def actor_losses(
+    own: tuple[Tensor, Tensor],
+    old: tuple[Tensor, Tensor],
+    log_prob: Tensor,
+    value: Tensor,
+    weights: tuple[Tensor, Tensor],
+    bound: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns the actor's loss, and without gradients mean entropy, mean divergence and how often it is too large.
+
+    All are scalars, of ``n`` steps; the last one is a fraction of them.
+
+    Args:
+        own: means and standard deviations, ``(n, nu)``.
+        old: those of the policy that collected.
+        log_prob: log-probabilities of drawn actions, ``(n,)``.
+        value: what the critic expects of them, ``(n,)``.
+        weights: temperature and weight of the divergence, scalars.
+        bound: of the divergence.
+    """
+    temperature, kl_weight = weights
+    divergence = kl(*old, *own)
+    exceeded = divergence >= bound
+    loss = torch.where(exceeded, kl_weight * divergence, temperature * log_prob - value).mean()
+    return loss, -log_prob.detach().mean(), divergence.detach().mean(), exceeded.float().mean()
+
+
 # The networks.
 
 
@@ -258,13 +328,13 @@ class ValueBins(nn.Module):
         half = (high - low) / (count - 1) / 2
         self.register_buffer("centers", torch.linspace(low, high, count), persistent=False)
         self.register_buffer("edges", torch.linspace(low - half, high + half, count + 1), persistent=False)
-        self.low, self.high, self.sigma = low, high, 2 * half * self.SPREAD
-        self.width = 2 * half
+        self.low, self.high, self.width = low, high, 2 * half
+        self.sharpness = 1.0 / (math.sqrt(2.0) * self.width * self.SPREAD)  # of the error function
 
     def encode(self, returns: Tensor) -> Tensor:
         """Returns the probabilities, shape ``(..., count)``, of a Gaussian about each return of shape ``(...)``."""
         returns = returns.clamp(self.low, self.high).unsqueeze(-1)
-        below = torch.erf((self.edges - returns) / (math.sqrt(2.0) * self.sigma))
+        below = torch.erf((self.edges - returns) * self.sharpness)
         return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
 
     def decode(self, logits: Tensor) -> Tensor:
@@ -298,6 +368,14 @@ class DistributionalQ(nn.Module):
         """Returns logits of shape ``(..., count)`` and the predicted next features of shape ``(..., hidden[-1])``."""
         features = self._features(observation, action)
         return self.value_head(features), self.predictor(features)
+
+    def losses(
+        self, observation: Tensor, action: Tensor, returns: Tensor, features: Tensor, alive: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the losses of the returns and of the features, of ``n`` steps: scalars."""
+        logits, predicted = self(observation, action)
+        aux = (mse_loss(predicted, features, reduction="none").mean(-1) * alive).mean()
+        return cross_entropy(logits, self.bins.encode(returns)), aux
 
     def value_and_features(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the mean return, shape ``(...)``, and the features, shape ``(..., hidden[-1])``."""

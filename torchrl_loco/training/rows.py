@@ -3,17 +3,20 @@
 import contextlib
 import functools
 import importlib
+import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+from torch.nn.functional import pad
 
 from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.policy import layers_of
+from torchrl_loco.training.adam import ALIGNED
 
 
 class Rows:
@@ -21,17 +24,16 @@ class Rows:
 
     Args:
         network: layers one after the other; any other, as a critic may be, computes as a whole.
-        first: what gives the network its rows: a norm, which has been applied, or an encoder of pixels, which is part
-            of the function then.
+        first: how many numbers it reads, or an encoder of pixels, which is part of the function then.
         dtype: the type of rows and weights.
 
     Attributes:
-        in_triton: whether kernels of Triton compute it (``mlp.py``).
+        in_triton: whether kernels of Triton compute all of it (``mlp.py``).
     """
 
-    def __init__(self, network: nn.Module, first: nn.Module, dtype: torch.dtype) -> None:
+    def __init__(self, network: nn.Module, first: PixelEncoder | int, dtype: torch.dtype) -> None:
         self._encoder = first if isinstance(first, PixelEncoder) else None
-        self._inputs = inputs = self._encoder.features if self._encoder else len(first.mean)  # type: ignore[arg-type]
+        self._inputs = inputs = first if isinstance(first, int) else first.features
         self._layers = [network]
         with contextlib.suppress(TypeError):
             layers = layers_of(network)
@@ -41,7 +43,9 @@ class Rows:
             self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
         self._parameters = list(network.parameters())
         fits = dtype == torch.bfloat16 and not self._encoder and are_linear_and_silu(self._layers, self._parameters)
-        self.in_triton = fits and triton_works(self._parameters[0].device)
+        device = self._parameters[0].device
+        self.in_triton = fits and triton_works(device)
+        self._normed = set(normed_silus(self._layers)) if triton_works(device) else set()
 
     def own(self, weights: Mapping[nn.Parameter, Tensor]) -> list[Tensor]:
         """Returns its own of the weights; rows of those after the first are as short as what they multiply."""
@@ -60,44 +64,61 @@ class Rows:
         Kernels of Triton write slopes by the weights into so many ``parts`` of the gradient as they ask for.
         """
         if self.in_triton and (parts is None or all(part.requires_grad for part in self._parameters)):
-            mlp, flat = triton_kernels(), rows.reshape(-1, rows.shape[-1])
+            mlp, flat = triton_kernels("mlp"), rows.reshape(-1, rows.shape[-1])
             if len(flat) * max(flat.stride(0), *map(len, self._parameters)) < mlp.MOST:
                 into = None if parts is None else parts(mlp.PARTS)
                 return mlp.SiluNetwork.apply(flat, into, *self.own(weights)).view(*rows.shape[:-1], -1)
         if self._encoder:
             own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}
             rows = functional_call(self._encoder, own, (rows,)).to(next(iter(own.values())).dtype)
+        bias = None
         for index, layer in enumerate(self._layers):
+            if index - 1 in self._normed:
+                continue
             reads_long = index == 0 and isinstance(layer, nn.Linear) and not self._encoder
             if index == 0 and not reads_long:
-                rows = rows[..., : self._inputs].clone()  # an activation may write in place
+                rows = rows[..., : self._inputs]
+                rows = rows if isinstance(layer, nn.LayerNorm) else rows.clone()  # an activation may write in place
             own = {
                 name: whole if reads_long or whole.shape == part.shape else whole[..., : part.shape[-1]]
                 for name, part in layer.named_parameters()
                 for whole in (weights[part],)
             }
-            if isinstance(layer, nn.Linear):
-                rows = Affine.apply(rows, own["weight"], own.get("bias"))
+            if index in self._normed:  # which adds the bias of the layer before
+                flat, shape = rows.reshape(-1, rows.shape[-1]), rows.shape
+                rows = triton_kernels("normed").NormedSilu.apply(flat, bias, *own.values(), layer.eps).view(shape)
+            elif isinstance(layer, nn.Linear):
+                bias = own.get("bias")
+                rows = Affine.apply(rows, own["weight"], None if index + 1 in self._normed else bias)
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
 
 
 class Affine(torch.autograd.Function):
-    """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long."""
+    """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long.
+
+    On CUDA it computes with a multiple of ``ALIGNED`` outputs, of which zeros are left out.
+    """
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Returns what the layer gives, shape ``(..., outputs)``."""
+        ctx.outputs, ctx.more = len(weight), -len(weight) % ALIGNED if rows.is_cuda else 0
+        if ctx.more:
+            weight, bias = pad(weight, (0, 0, 0, ctx.more)), None if bias is None else pad(bias, (0, ctx.more))
         ctx.save_for_backward(rows, weight)
-        return nn.functional.linear(rows, weight, bias)
+        return nn.functional.linear(rows, weight, bias)[..., : ctx.outputs]
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """Returns the slopes by rows, weight and bias."""
         (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
-        of_bias = (slope.new_ones(1, len(slope)) @ slope)[0] if by_bias else None
-        return slope @ weight if by_rows else None, slope.mT @ rows if by_weight else None, of_bias
+        slope = pad(slope, (0, ctx.more)) if ctx.more else slope
+        flat, n = slope.reshape(-1, slope.shape[-1]), slope.shape[:-1].numel()
+        of_weight = (flat.mT @ rows.reshape(n, -1))[: ctx.outputs] if by_weight else None
+        of_bias = (flat.new_ones(1, n) @ flat)[0, : ctx.outputs] if by_bias else None
+        return slope @ weight if by_rows else None, of_weight, of_bias
 
 
 def are_linear_and_silu(layers: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> bool:
@@ -106,25 +127,33 @@ def are_linear_and_silu(layers: Sequence[nn.Module], parameters: Sequence[nn.Par
     return list(map(type, layers)) == kinds and len(parameters) == len(kinds) + 1
 
 
-def triton_kernels() -> ModuleType:
-    """Returns the module of the kernels, which imports Triton."""
-    return importlib.import_module("torchrl_loco.training.mlp")
+def normed_silus(layers: Sequence[nn.Module]) -> Iterator[int]:
+    """Yields the numbers of the layer norms of rows, with a weight and a bias, after which SiLU follows."""
+    for index, (layer, after) in enumerate(itertools.pairwise(layers)):
+        if type(layer) is nn.LayerNorm and type(after) is nn.SiLU and len(layer.normalized_shape) == 1:
+            if layer.weight is not None and layer.bias is not None:
+                yield index
+
+
+def triton_kernels(name: str) -> ModuleType:
+    """Returns a module of kernels, ``mlp`` or ``normed``, which imports Triton."""
+    return importlib.import_module(f"torchrl_loco.training.{name}")
 
 
 @functools.cache
 def triton_works(device: torch.device) -> bool:
-    """Returns whether Triton can compile kernels for a GPU; a warning says why it cannot.
+    """Returns whether Triton can compile kernels for a device; of a GPU, a warning says why it cannot.
 
     Triton comes with torch for Linux, and needs a compiler of C. GPUs before compute capability 8.0, without tensor
     cores for bfloat16, keep torch's kernels.
     """
-    if torch.cuda.get_device_capability(device) < (8, 0):
+    if device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0):
         return False
     try:
         importlib.import_module("triton").runtime.driver.active.get_current_target()  # which compiles C
     except Exception as error:
         logging.getLogger("torchrl_loco").warning(
-            "updates take a third longer: Triton, which needs Linux and gcc or clang, cannot make kernels here (%s)",
+            "starts and updates take longer: Triton, which needs Linux and gcc or clang, cannot make kernels here (%s)",
             error,
         )
         return False

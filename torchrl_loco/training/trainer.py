@@ -110,14 +110,14 @@ class Trainer:
                 f"{part} ({frames}) must be at least {self.frames_per_iteration}: one batch of "
                 f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
-        if getattr(config, "compile", False) and torch.device(config.device).type == "cuda":
+        make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
+        if torch.device(config.device).type == "cuda" and make_algorithm.compiles(config):
             start_compiler()  # while the environment's kernels are compiled
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
         self.environments = Environments(dataclasses.replace(config, task=run.task), given.env)
         dump = run.nan_dump if first else run.nan_dump.with_stem(f"nan_dump_rank{rank}")
         self.env = self.environments.training(dump)
-        make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
         spaces = Spaces.of(self.env, config.critic_from_pixels)
         if spaces.pixels:
             needed = COPIES_IN_BATCH * config.frames_per_batch * math.prod(spaces.pixels)
