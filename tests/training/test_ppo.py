@@ -18,7 +18,7 @@ from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.algorithm import clip_and_step
-from torchrl_loco.training.ppo import PPO
+from torchrl_loco.training.ppo import PPO, clipped_loss
 from torchrl_loco.training.rows import are_linear_and_silu
 
 
@@ -437,6 +437,22 @@ def test_what_is_computed_beside_is_the_same():
     assert all(torch.equal(*pair) for pair in zip(parameters[True, True], parameters[True, False], strict=True))
     for ours, exact in zip(parameters[True, True], parameters[False, False], strict=True):
         torch.testing.assert_close(ours, exact, rtol=0.1, atol=0.01)
+
+
+@pytest.mark.gpu
+@for_each("steps", [1, 7, 100])
+def test_the_loss_is_the_same_on_cuda(steps):
+    """There, threads of a warp add up their numbers, also of a warp that is not full."""
+    torch.manual_seed(0)
+    outputs = torch.randn(steps, 6), 0.5 + torch.rand(6), torch.randn(steps, 1)
+    data = {"action": torch.randn(steps, 6), "log_prob": torch.full((steps,), -9.0)}
+    data.update(advantage=torch.randn(steps, 1), value_target=torch.randn(steps, 1))
+    config = preset("walker_stand", "cuda", "ppo")
+    expected = clipped_loss(*outputs, data, config, bounded=False)
+    there = [x.cuda() for x in outputs], {name: x.cuda() for name, x in data.items()}
+    found = clipped_loss(*there[0], there[1], config, bounded=False)
+    for ours, exact in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours.cpu(), exact, rtol=1e-4, atol=1e-5)
 
 
 def test_which_networks_triton_computes():

@@ -270,10 +270,42 @@ def drawn(mean: Tensor, std: Tensor, noise: Tensor, bounded: bool) -> tuple[Tens
     return (action, log_prob, normal) if bounded else (action, log_prob)
 
 
+def lanes_of(device: torch.device) -> int:
+    """Returns how many threads add up what they have without memory between them: a warp, on the CPU one."""
+    return 32 if device.type == "cuda" else 1
+
+
+ADD_LANES = """
+#ifdef __CUDA_ARCH__
+#pragma unroll 1
+for (int apart = 16; apart > 0; apart /= 2) {
+  for (auto& number : values.c) number += __shfl_xor_sync(0xffffffffu, number, apart);
+}
+#endif
+return values;
+"""
+
+
+@functools.cache
+def adding(numbers: Any) -> wp.Function:
+    """Returns the function that adds up vectors of all lanes, in an order that is always the same."""
+
+    @wp.func_native(ADD_LANES)
+    def add(values: numbers) -> numbers: ...
+
+    return add
+
+
 @functools.cache
 def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
-    """Returns the kernel of PPO's loss for ``nu`` actions."""
+    """Returns the kernel of PPO's loss for ``nu`` actions.
+
+    Lanes write a row of sums together; the mean of the rows is that of the steps. Loops over actions stay loops: a
+    launch fetches each instruction anew, which takes longer than to execute it.
+    """
     Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+    Actions, Sums = (wp.types.vector(size, float) for size in (nu, METRICS + nu))  # noqa: N806
+    add = adding(Sums)
 
     @wp.kernel(enable_backward=False, module="unique")
     def loss(
@@ -288,16 +320,20 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
         lowest: float,
         highest: float,
         entropy_coeff: float,
+        lanes: int,
         slope_mean: Rows,
         slope_value: Rows,
         sums: wp.array2d[float],
     ):
-        step = wp.tid()
+        thread = wp.tid()
+        step = wp.min(thread, mean.shape[0] - 1)  # whoever comes after the last does the same, and adds nothing
         share = 1.0 / float(mean.shape[0])
         log_prob = float(0.0)
         entropy = float(0.0)
-        for i in range(wp.static(nu)):
+        zs = Actions()
+        for i in range(mean.shape[1]):
             z = (action[step, i] - float(mean[step, i])) / std[i]
+            zs[i] = z
             constant = wp.log(std[i]) + HALF_LOG_2_PI
             log_prob -= 0.5 * z * z + constant
             if wp.static(bounded):  # of one sample u under tanh
@@ -317,13 +353,14 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
         if wp.isnan(error):
             of_value = error
         slope_value[step, 0] = slope_value.dtype(share * CRITIC_COEFF * of_value)
-        sums[step, 0] = -wp.min(gain, clipped_gain)
-        sums[step, 1] = CRITIC_COEFF * wp.where(wp.abs(error) < 1.0, 0.5 * error * error, wp.abs(error) - 0.5)
-        sums[step, 2] = entropy
-        sums[step, 3] = -log_ratio
-        sums[step, 4] = wp.where(clipped == log_ratio, 0.0, 1.0)
-        for i in range(wp.static(nu)):
-            z = (action[step, i] - float(mean[step, i])) / std[i]
+        own = Sums()
+        own[0] = -wp.min(gain, clipped_gain)
+        own[1] = CRITIC_COEFF * wp.where(wp.abs(error) < 1.0, 0.5 * error * error, wp.abs(error) - 0.5)
+        own[2] = entropy
+        own[3] = -log_ratio
+        own[4] = wp.where(clipped == log_ratio, 0.0, 1.0)
+        for i in range(mean.shape[1]):
+            z = zs[i]
             by_mean = slope * z / std[i]
             by_std = (slope * (z * z - 1.0) - entropy_coeff) / std[i]
             if wp.static(bounded):
@@ -332,7 +369,13 @@ def loss_of(nu: int, bounded: bool, dtype: torch.dtype) -> wp.Kernel:
                 by_mean += turn
                 by_std += turn * e
             slope_mean[step, i] = slope_mean.dtype(share * by_mean)
-            sums[step, METRICS + i] = by_std
+            own[METRICS + i] = by_std
+        if thread > step:
+            own = Sums()
+        total = add(own)
+        weight = float(sums.shape[0]) / float(mean.shape[0])
+        for i in range(thread % lanes, sums.shape[1], lanes):
+            sums[thread // lanes, i] = weight * total[i]
 
     return loss
 
@@ -362,8 +405,9 @@ def clipped_loss(
     noise = torch.randn(mean.shape, device=mean.device) if bounded else std.new_empty(0, nu)
     numbers = [data[name].reshape(steps) for name in ("log_prob", "advantage", "value_target")]
     inputs = [mean, std, value, data["action"], *numbers, noise]
-    slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(steps, METRICS + nu)
+    rows = -(-steps // (lanes := lanes_of(mean.device)))
+    slopes = torch.empty_like(mean), torch.empty_like(value), std.new_empty(rows, METRICS + nu)
     bounds = math.log1p(-config.clip_epsilon), math.log1p(config.clip_epsilon)
-    launch(loss_of(nu, bounded, mean.dtype), steps, [*inputs, *bounds, config.entropy_coeff], slopes)
+    launch(loss_of(nu, bounded, mean.dtype), rows * lanes, [*inputs, *bounds, config.entropy_coeff, lanes], slopes)
     means = slopes[2].mean(0)
     return slopes[0], means[METRICS:], slopes[1], means[:METRICS]
