@@ -26,6 +26,7 @@ LOWEST_LR, HIGHEST_LR = wp.constant(1e-5), wp.constant(1e-2)  # of a learning ra
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 LOG_2 = wp.constant(math.log(2.0))
 CRITIC_COEFF = 0.5
+HEIGHT = 8  # rows of which a thread normalises a number
 METRICS = 5  # numbers of a step whose means are metrics; the slopes of the deviations follow them
 
 
@@ -195,19 +196,43 @@ def follow(kl: wp.array[float], target: float, lr: wp.array[float]):
     lr[0] = wp.clamp(lr[0] * factor, LOWEST_LR, HIGHEST_LR)
 
 
+# In C++, as Warp computes the address of each number from strides anew, and of indices that may be negative.
+NORMALISE = f"""
+const int HEIGHT = {HEIGHT}, width = rows.shape[1], wide = out.shape[1];
+const int first = group * HEIGHT, last = wp::min(HEIGHT, rows.shape[0] - first) - 1, read = wp::min(column, width - 1);
+const float* from = rows.data + size_t(first) * width + read;
+auto* to = out.data + size_t(first) * wide + column;
+float own[HEIGHT];  // whose reads are all on their way before the first write
+for (int i = 0; i < HEIGHT; ++i, from += i <= last ? width : 0) own[i] = *from;
+const float center = mean.data[read], spread = wp::sqrt(var.data[read] + 1e-6f);
+for (int i = 0; i < HEIGHT; ++i, to += wide) {{
+  const float value = wp::clamp((own[i] - center) / spread, -limit, limit);
+  if (i <= last) *to = column < width ? value : 0.0f;
+}}
+"""
+
+
 # A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
 @functools.cache
 def normalise_of(dtype: torch.dtype) -> wp.Kernel:
-    """Returns the kernel that writes normalised rows."""
+    """Returns the kernel that writes normalised rows; all arrays are contiguous."""
     Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.func_native(NORMALISE)
+    def write(
+        rows: wp.array2d[float],
+        mean: wp.array[float],
+        var: wp.array[float],
+        limit: float,
+        out: Rows,
+        group: int,
+        column: int,
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def normalise(rows: wp.array2d[float], mean: wp.array[float], var: wp.array[float], limit: float, out: Rows):
-        row, column = wp.tid()
-        value = float(0.0)
-        if column < rows.shape[1]:
-            value = wp.clamp((rows[row, column] - mean[column]) / wp.sqrt(var[column] + 1.0e-6), -limit, limit)
-        out[row, column] = out.dtype(value)
+        group, column = wp.tid()
+        write(rows, mean, var, limit, out, group, column)
 
     return normalise
 
@@ -217,8 +242,9 @@ def normalised(rows: Tensor, norm: ObservationNorm, dtype: torch.dtype) -> Tenso
     """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``ALIGNED``."""
     norm.check(rows)
     wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // ALIGNED) * ALIGNED, dtype=dtype)
-    flat, out = rows.reshape(-1, rows.shape[-1]), wide.view(-1, wide.shape[-1])
-    launch(normalise_of(dtype), tuple(out.shape), [flat, norm.mean, norm.var, norm.limit], [out], LARGE)
+    flat, out = rows.reshape(-1, rows.shape[-1]).contiguous(), wide.view(-1, wide.shape[-1])
+    dim = -(-len(out) // HEIGHT), out.shape[1]
+    launch(normalise_of(dtype), dim, [flat, norm.mean, norm.var, norm.limit], [out], LARGE)
     return wide
 
 
