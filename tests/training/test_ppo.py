@@ -18,7 +18,7 @@ from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training.actor import deterministic_policy
 from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.algorithm import clip_and_step
-from torchrl_loco.training.ppo import PPO, clipped_loss
+from torchrl_loco.training.ppo import PPO, clipped_loss, standardise
 from torchrl_loco.training.rows import are_linear_and_silu
 
 
@@ -213,6 +213,28 @@ def test_advantages_are_normalised():
     data["advantage"] = 1e3 * data["advantage"] + 5e2
     assert loss.abs() > 1e-3
     torch.testing.assert_close(metrics_of(ppo, data)["loss_objective"], loss, rtol=1e-3, atol=0)
+
+
+def check_standardised(device):
+    """Rows of any length, beside other numbers; a row of one has no deviation."""
+    for size in (1, 7, 10_000):
+        whole = 1e3 + torch.randn(3 * size, 5, device=device)
+        numbers, others = whole[:, 1].view(3, size), whole[:, 2:].clone()
+        expected = numbers.double() - numbers.double().mean(1, keepdim=True)
+        if size > 1:
+            expected /= expected.std(1, keepdim=True)
+        standardise(numbers)
+        torch.testing.assert_close(numbers, expected.float(), rtol=1e-5, atol=1e-5)
+        assert torch.equal(whole[:, 2:], others)
+
+
+def test_rows_are_standardised():
+    check_standardised("cpu")
+
+
+@pytest.mark.gpu
+def test_rows_are_standardised_on_cuda():
+    check_standardised("cuda")
 
 
 def test_entropy_is_rewarded():

@@ -162,9 +162,7 @@ class PPO(Algorithm):
 
     def minibatches(self, steps: TensorDictBase) -> Iterable[TensorDictBase]:
         """Returns minibatches whose advantages have mean 0 and standard deviation 1."""
-        advantages = steps["advantage"].view(-1, self.config.minibatch_size)
-        spread, center = torch.std_mean(advantages, 1, keepdim=True)
-        advantages.sub_(center).div_(spread.nan_to_num(0.0).clamp(min=1e-6))  # one step has no deviation
+        standardise(steps["advantage"].view(-1, self.config.minibatch_size))
         return super().minibatches(steps)
 
     def schedule(self, progress: float) -> None:
@@ -320,6 +318,50 @@ def adding(numbers: Any) -> wp.Function:
     def add(values: numbers) -> numbers: ...
 
     return add
+
+
+add_moments = adding(wp.vec2d)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def moments_of_parts(numbers: wp.array2d[float], lanes: int, moments: wp.array3d[wp.float64]):
+    row, thread = wp.tid()
+    own = wp.vec2d()
+    for first in range(thread, numbers.shape[1], 8 * lanes * lanes):
+        for i in range(8):  # reads that do not wait for each other
+            place = first + i * lanes * lanes
+            read = numbers[row, wp.min(place, numbers.shape[1] - 1)]
+            number = wp.float64(wp.where(place < numbers.shape[1], read, 0.0))
+            own += wp.vec2d(number, number * number)
+    total = add_moments(own)
+    if thread % lanes == 0:
+        moments[row, thread // lanes, 0] = total[0]
+        moments[row, thread // lanes, 1] = total[1]
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def standardise_by(moments: wp.array3d[wp.float64], lanes: int, numbers: wp.array2d[float]):
+    row, column = wp.tid()
+    part = column % lanes
+    total = add_moments(wp.vec2d(moments[row, part, 0], moments[row, part, 1]))
+    if column < numbers.shape[1]:
+        mean = total[0] / wp.float64(numbers.shape[1])
+        var = float(total[1] - total[0] * mean) / float(wp.max(numbers.shape[1] - 1, 1))  # one has no deviation
+        away = float(wp.float64(numbers[row, column]) - mean)
+        numbers[row, column] = away / wp.max(wp.sqrt(var), 1.0e-6)
+
+
+@torch.no_grad()
+def standardise(numbers: Tensor) -> None:
+    """Gives each row of ``(m, n)`` numbers mean 0 and standard deviation 1, in place.
+
+    A row has as many parts as there are lanes, whose threads read at once: torch's has one block of threads. Moments
+    are sums of squares in double precision, where a mean cancels less than single precision rounds.
+    """
+    (rows, count), lanes = numbers.shape, lanes_of(numbers.device)
+    moments = numbers.new_empty(rows, lanes, 2, dtype=torch.float64)
+    launch(moments_of_parts, (rows, lanes * lanes), [numbers, lanes], [moments])
+    launch(standardise_by, (rows, -(-count // lanes) * lanes), [moments, lanes], [numbers])
 
 
 @functools.cache
