@@ -6,11 +6,12 @@ import traceback
 import pytest
 import torch
 from small_runs import made
+from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchrl_loco.training import Trainer
 from torchrl_loco.training.actor import SquashedNormal
-from torchrl_loco.training.algorithm import compiled
+from torchrl_loco.training.algorithm import Packed, compiled
 
 HOST = ("_local_scalar_dense", "lift_fresh", "nonzero", "aten.equal")
 """Operations that read a tensor's value, or make a tensor from a value of Python's."""
@@ -122,3 +123,17 @@ def test_a_process_may_compile_more_often_than_torch_lets_one_function():
     assert [len(x) for x in doubled] == list(sizes)
     with pytest.raises(TypeError, match="cannot trace what is asked; train with compile=False"):
         compiled(lambda x: 2 * x if x.sum() > 0 else x, "what is asked", backend="eager")(torch.ones(2))
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_shuffled_steps_are_the_same_steps(device):
+    """Of entries of any type and length, NaN too."""
+    kinds = torch.float32, torch.bfloat16, torch.bool, torch.int64, torch.uint8
+    entries = {f"{kind}": torch.randn(50, 3).mul(9.0).to(kind) for kind in kinds}
+    entries |= {"row": torch.randn(50), "picture": torch.randn(50, 7, 5).to(torch.float16)}
+    steps = TensorDict(entries, [50]).to(device)
+    steps["row"][::3] = torch.nan
+    order = torch.randperm(50, device=device)[:33]
+    chosen = Packed(steps)[order]
+    for key, entry in steps.items():
+        torch.testing.assert_close(chosen[key], entry[order], rtol=0, atol=0, equal_nan=True)

@@ -201,7 +201,8 @@ class Vectors:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
         given = [] if self.whole.grad is None else [self.whole.grad]
         if self._in_parts is not None and self._has_parts:
-            given.append(self._in_parts.detach().sum(0))
+            given.append(torch.empty_like(self.whole))
+            launch(sum_of_parts, len(self.whole), [self._in_parts], given[-1:], LARGE)
         gradient = functools.reduce(torch.add, given) if given else torch.zeros_like(self.whole)
         own = [(part.grad, view) for part, view in zip(self._parts, self._views(gradient), strict=True)]
         found = [(of_part, view) for of_part, view in own if of_part is not None]
@@ -226,6 +227,15 @@ class Vectors:
         """Yields what Adam keeps of each parameter, as views."""
         for moments in zip(*map(self._views, self.moments), strict=True):
             yield dict(zip(("step", "exp_avg", "exp_avg_sq"), (self.counts[0], *moments), strict=True))
+
+
+@wp.kernel(enable_backward=False)
+def sum_of_parts(parts: wp.array2d[float], out: wp.array[float]):
+    i = wp.tid()
+    total = float(0.0)
+    for part in range(parts.shape[0]):
+        total += parts[part, i]
+    out[i] = total
 
 
 @wp.kernel(enable_backward=False)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+import warp as wp
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -20,7 +21,7 @@ from torchrl_loco.policy import ObservationNorm, Policy, layers_of, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, layers_of_actor
-from torchrl_loco.training.adam import FlatAdam
+from torchrl_loco.training.adam import LARGE, FlatAdam, launch
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
@@ -354,7 +355,12 @@ class Packed:
 
     def __getitem__(self, order: torch.Tensor) -> TensorDictBase:
         """Returns the steps with the numbers ``order``, as views of one new matrix."""
-        return self._views(self._rows[order])
+        if not self._rows.is_cuda:
+            return self._views(self._rows[order])
+        words = self._rows.view(torch.int64)
+        chosen = words.new_empty(len(order), words.shape[1])
+        launch(choose, tuple(chosen.shape), [words, order], [chosen], LARGE)
+        return self._views(chosen.view(torch.uint8))
 
     def _views(self, rows: torch.Tensor) -> TensorDictBase:
         entries = {
@@ -362,6 +368,12 @@ class Packed:
             for key, columns, dtype, shape in self._entries
         }
         return TensorDict(entries, batch_size=len(rows), device=rows.device)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)
+def choose(rows: wp.array2d[wp.int64], order: wp.array[wp.int64], out: wp.array2d[wp.int64]):
+    i, j = wp.tid()
+    out[i, j] = rows[order[i], j]
 
 
 def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:

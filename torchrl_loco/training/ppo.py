@@ -18,7 +18,7 @@ from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
 from torchrl_loco.training.adam import ALIGNED, LARGE, SMALL, launch
-from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
+from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
 from torchrl_loco.training.config import PPOConfig
 from torchrl_loco.training.rows import Rows, triton_kernels
 
@@ -79,7 +79,8 @@ class PPO(Algorithm):
         """Compiles its kernels all at once, instead of each where it is first launched."""
         action = self.spaces.action, self.spaces.bounded, self._dtype
         small = draw_of(*action), loss_of(*action), follow
-        self.optimizer.compile_with([(normalise_of(self._dtype), LARGE), *((kernel, SMALL) for kernel in small)])
+        large = normalise_of(self._dtype), choose
+        self.optimizer.compile_with([*((kernel, LARGE) for kernel in large), *((kernel, SMALL) for kernel in small)])
         if fast := [rows for rows in (self._mean, self._value) if rows.in_triton]:
             mlp, weights = triton_kernels("mlp"), self.optimizer.wide(self._dtype)
             parts = self.optimizer.parts(mlp.PARTS).detach()

@@ -23,7 +23,7 @@ from torchrl_loco.policy import ObservationNorm, layers_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of, normed_layers
 from torchrl_loco.training.adam import LARGE, FlatAdam
-from torchrl_loco.training.algorithm import Acting, Algorithm, clip_and_step
+from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
 from torchrl_loco.training.config import REPPOConfig, TrainingConfig
 from torchrl_loco.training.ppo import normalise_of
 from torchrl_loco.training.reppo_rows import ReppoRows
@@ -74,7 +74,7 @@ class REPPO(Algorithm):
             sizes, dtype = (spaces.observation, spaces.critic), torch.bfloat16 if config.bf16 else torch.float32
             parts = nn.Sequential(*layers), extract, self.critic, sizes, dtype
             self._rows = self._q = ReppoRows(*parts, config.minibatch_size)
-            self.critic_optimizer.compile_with([(normalise_of(dtype), LARGE)])
+            self.critic_optimizer.compile_with([(normalise_of(dtype), LARGE), (choose, LARGE)])
             self._policy = self._rows.distribution
         self._fused_values = self.fused(self._values, "actor and critic", config.bf16)
         self._fused_critic_losses = self.fused(self._q.losses, "the critic", config.bf16)
