@@ -11,6 +11,8 @@ from torch import nn
 
 from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training import reppo as of_reppo
+from torchrl_loco.training.adam import FlatAdam
+from torchrl_loco.training.rows import Rows
 
 pytestmark = pytest.mark.gpu
 ROUNDING = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
@@ -92,3 +94,40 @@ def test_updates_are_those_of_the_modules(spaces, monkeypatch):
     torch.testing.assert_close(metrics, wanted, rtol=1e-3, atol=1e-4)
     assert (weights - of_modules).abs().max() < 1e-3
     assert math.isclose(weights.norm().item(), of_modules.norm().item(), rel_tol=1e-4)
+
+
+def test_norms_anywhere_in_a_network():
+    """Behind linear layers, with and without a bias, behind activations, at the beginning, and without SiLU."""
+    layers: list[nn.Module] = [nn.LayerNorm(24), nn.SiLU(), nn.Linear(24, 48), nn.SiLU(), nn.LayerNorm(48), nn.SiLU()]
+    layers += [
+        nn.Linear(48, 40, bias=False),
+        nn.LayerNorm(40),
+        nn.SiLU(),
+        nn.Linear(40, 32),
+        nn.LayerNorm(32),
+        nn.SiLU(),
+    ]
+    layers += [
+        nn.LayerNorm(32, bias=False),
+        nn.SiLU(),
+        nn.Linear(32, 20),
+        nn.LayerNorm(20),
+        nn.Tanh(),
+        nn.Linear(20, 7),
+    ]
+    torch.manual_seed(0)
+    network = nn.Sequential(*layers).cuda()
+    with torch.no_grad():
+        for part in network.parameters():
+            part += 0.3 * torch.randn_like(part)
+    optimizer = FlatAdam(network.parameters(), lr=torch.tensor(1e-3, device="cuda"))
+    rows, slope = drawn(500, 24), drawn(500, 7)
+    expected = network(rows)
+    expected.backward(slope)
+    wanted = [part.grad.clone() for part in network.parameters()]
+    optimizer.zero_grad()
+    found = Rows(network, 24, torch.float32)(nn.functional.pad(rows, (0, 8)), optimizer.wide(torch.float32))
+    found.backward(slope)
+    found_slopes = optimizer._vectors[0]._views(optimizer._vectors[0].gradient())
+    for ours, theirs in zip([found, *found_slopes], [expected, *wanted], strict=True):
+        assert (ours - theirs).norm() <= 1e-4 * theirs.norm()

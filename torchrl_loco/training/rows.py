@@ -71,7 +71,7 @@ class Rows:
         if self._encoder:
             own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}
             rows = functional_call(self._encoder, own, (rows,)).to(next(iter(own.values())).dtype)
-        bias = None
+        left = None  # of a linear layer, the bias that the norm behind it adds
         for index, layer in enumerate(self._layers):
             if index - 1 in self._normed:
                 continue
@@ -84,12 +84,13 @@ class Rows:
                 for name, part in layer.named_parameters()
                 for whole in (weights[part],)
             }
-            if index in self._normed:  # which adds the bias of the layer before
+            if index in self._normed:
                 flat, shape = rows.reshape(-1, rows.shape[-1]), rows.shape
-                rows = triton_kernels("normed").NormedSilu.apply(flat, bias, *own.values(), layer.eps).view(shape)
+                rows = triton_kernels("normed").NormedSilu.apply(flat, left, *own.values(), layer.eps).view(shape)
+                left = None
             elif isinstance(layer, nn.Linear):
-                bias = own.get("bias")
-                rows = Affine.apply(rows, own["weight"], None if index + 1 in self._normed else bias)
+                left = own.pop("bias", None) if index + 1 in self._normed else None
+                rows = Affine.apply(rows, own["weight"], own.get("bias"))
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
