@@ -376,6 +376,14 @@ def test_what_is_frozen_stays():
         assert (by == 0.0) == (".0.weight" in name or ".0.bias" in name), name
 
 
+def test_activations_may_write_in_place():
+    def network(inputs, outputs):
+        return nn.Sequential(nn.Linear(inputs, 12), nn.ELU(inplace=True), nn.Linear(12, outputs))
+
+    config = preset("walker_stand", "cpu", "ppo", total_frames=10_000, **EIGHT)
+    assert all(by > 0.0 for by in one_update(PPO(config, WALKER, network)).values())
+
+
 def test_parameters_that_were_moved_still_learn():
     ppo = made(**EIGHT)
     ppo.actor.double().float()

@@ -1,7 +1,5 @@
 """REPPO's kernels of Triton beside torch in double precision, and its updates beside those of its modules."""
 
-import math
-
 import pytest
 import torch
 from for_each import for_each
@@ -15,6 +13,7 @@ from torchrl_loco.training.adam import FlatAdam
 from torchrl_loco.training.rows import Rows
 
 pytestmark = pytest.mark.gpu
+UNBOUNDED = Spaces(24, 6, privileged=31, bounded=False)
 ROUNDING = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 on_both = for_each("dtype", list(ROUNDING))
 
@@ -60,23 +59,30 @@ def test_distributions_and_errors(dtype):
     of_exact = [torch.autograd.grad(wanted, exact)[0], torch.autograd.grad(mean, exact, slope.double())[0]]
     check([loss, value, *slopes], [wanted, mean, *of_exact], dtype)
 
-    found, features = drawn(500, 48, dtype=dtype).requires_grad_(), drawn(500, 64, dtype=dtype)[:, :48]
+    found, features = (drawn(500, 64, dtype=dtype)[:, :48].requires_grad_() for _ in range(2))
     alive = (drawn(500, 3) > 0).float()[:, 0]
     exact = found.detach().double().requires_grad_()
-    error = kernels.MeanLoss.apply(found, *kernels.error(found.detach(), features, alive))
+    error = kernels.MeanLoss.apply(found, *kernels.squared_error(found.detach(), features, alive))
     wanted = ((exact - features.double()).square().mean(-1) * alive).mean()
     check([error, *torch.autograd.grad(error, found)], [wanted, *torch.autograd.grad(wanted, exact)], dtype)
 
 
-@for_each("spaces", [WALKER, Spaces(24, 6, privileged=31, bounded=False)])
-def test_updates_are_those_of_the_modules(spaces, monkeypatch):
-    """With the divergence within its bound, so that the critic's slope by actions counts."""
+@for_each(
+    ("spaces", "hidden", "kl_bound"),
+    [
+        (WALKER, (64, 48), 100.0),
+        (WALKER, (40, 40), 2.0),
+        (Spaces(24, 6, privileged=31, bounded=False), (48, 64), 100.0),
+    ],
+)
+def test_updates_are_those_of_the_modules(spaces, hidden, kl_bound, monkeypatch):
+    """Within the bound of the divergence, so that the critic's slope by actions counts, and in part beyond it."""
 
     def trained(quick):
         monkeypatch.setattr(of_reppo, "triton_works", lambda device: quick)
-        settings = {"num_envs": 32, "num_steps": 8, "minibatch_size": 64, "hidden": (64, 48), "epochs": 2}
+        settings = {"num_envs": 32, "num_steps": 8, "minibatch_size": 64, "hidden": hidden, "epochs": 2}
         torch.manual_seed(0)
-        config = preset("walker_stand", "cuda", "reppo", kl_bound=100.0, compile=False, bf16=False, **settings)
+        config = preset("walker_stand", "cuda", "reppo", kl_bound=kl_bound, compile=False, bf16=False, **settings)
         reppo = of_reppo.REPPO(config, spaces)
         assert (reppo._rows is not None) == quick
         sizes = {"observation": 24, **({"privileged": 31} if spaces.privileged else {})}
@@ -87,13 +93,25 @@ def test_updates_are_those_of_the_modules(spaces, monkeypatch):
             after = {name: drawn(32, 8, size) for name, size in sizes.items()} | {"reward": drawn(32, 8, 1)}
             after |= {"terminated": drawn(32, 8, 1) > 1.5, "done": drawn(32, 8, 1) > 1.0}
             metrics = reppo.update(batch.update(of_policy).update({"next": after}), progress=0.0)
-        begin = [each.clone() for each in reppo.actor.parameters()]
-        return metrics, torch.cat([each.flatten() for each in [*begin, *reppo.critic.parameters()]]).detach()
+        return metrics, torch.cat([part.flatten() for part in reppo.networks.parameters()]).detach()
 
     (metrics, weights), (wanted, of_modules) = trained(quick=True), trained(quick=False)
     torch.testing.assert_close(metrics, wanted, rtol=1e-3, atol=1e-4)
     assert (weights - of_modules).abs().max() < 1e-3
-    assert math.isclose(weights.norm().item(), of_modules.norm().item(), rel_tol=1e-4)
+
+
+def test_an_actor_of_linear_layers_learns_in_bfloat16():
+    settings = {"num_envs": 32, "num_steps": 8, "minibatch_size": 64, "epochs": 1, "hidden": (64, 48)}
+    config = preset("walker_stand", "cuda", "reppo", bf16=True, **settings)
+    reppo = of_reppo.REPPO(config, WALKER, lambda i, o: nn.Sequential(nn.Linear(i, 32), nn.SiLU(), nn.Linear(32, o)))
+    begin = [part.clone() for part in reppo.actor.parameters()]
+    batch = TensorDict({"observation": drawn(32, 8, 24)}, (32, 8))
+    with torch.no_grad():
+        batch = reppo.acting()(batch)
+    after = {"observation": drawn(32, 8, 24), "reward": drawn(32, 8, 1)}
+    after |= dict.fromkeys(("terminated", "done"), torch.zeros(32, 8, 1, dtype=torch.bool, device="cuda"))
+    reppo.update(batch.update({"next": after}), progress=0.0)
+    assert all((old != new).any() for old, new in zip(begin, reppo.actor.parameters(), strict=True))
 
 
 def test_norms_anywhere_in_a_network():

@@ -27,7 +27,7 @@ def _layer_norm(x, add, row, width, x_row, eps, adds: tl.constexpr, block: tl.co
 
 
 @triton.jit
-def _forth(x, add, w, b, out, width, x_row, eps, adds: tl.constexpr, block: tl.constexpr):
+def _forward(x, add, w, b, out, width, x_row, eps, adds: tl.constexpr, block: tl.constexpr):
     row, ks = tl.program_id(0), tl.arange(0, block)
     normed, _ = _layer_norm(x, add, row, width, x_row, eps, adds, block)
     gain, shift = tl.load(w + ks, ks < width, 0.0).to(tl.float32), tl.load(b + ks, ks < width, 0.0).to(tl.float32)
@@ -36,7 +36,7 @@ def _forth(x, add, w, b, out, width, x_row, eps, adds: tl.constexpr, block: tl.c
 
 
 @triton.jit
-def _back(
+def _backward(
     d, x, add, w, b, dx, sums, n, width, x_row, eps, adds: tl.constexpr, learns: tl.constexpr, block: tl.constexpr
 ):  # fmt: skip
     ks = tl.arange(0, block)
@@ -67,7 +67,7 @@ def _back(
 
 
 @triton.jit
-def _added(sums, out, parts, width, block_n: tl.constexpr, block_k: tl.constexpr):
+def _sum_of_parts(sums, out, parts, width, block_n: tl.constexpr, block_k: tl.constexpr):
     ks = tl.program_id(0) * block_k + tl.arange(0, block_k)
     total = tl.zeros((block_n, block_k), tl.float32)
     for start in range(0, parts, block_n):
@@ -89,7 +89,7 @@ def normed(
     n, width = rows.shape
     out = rows.new_empty(n, width)
     args = rows, weight if add is None else add, weight, bias, out, width, rows.stride(0), eps
-    start(_forth, (n,), args, {"adds": add is not None, **_block(width)})
+    start(_forward, (n,), args, {"adds": add is not None, **_block(width)})
     return out
 
 
@@ -108,10 +108,10 @@ def normed_back(
     dx, programs = torch.empty_like(d), min(n, PROGRAMS)
     sums, total = torch.empty(programs, 3 * width, device=d.device), weight.new_empty(3, width)
     args = d, rows, weight if add is None else add, weight, bias, dx, sums, n, width, rows.stride(0), eps
-    start(_back, (programs,), args, {"adds": add is not None, "learns": learns, **_block(width)})
+    start(_backward, (programs,), args, {"adds": add is not None, "learns": learns, **_block(width)})
     if learns:
         sizes = {"block_n": 256, "block_k": 16, "num_warps": 8}
-        start(_added, (triton.cdiv(3 * width, sizes["block_k"]),), (sums, total, programs, 3 * width), sizes)
+        start(_sum_of_parts, (triton.cdiv(3 * width, sizes["block_k"]),), (sums, total, programs, 3 * width), sizes)
     return dx, total
 
 
@@ -129,10 +129,11 @@ class NormedSilu(torch.autograd.Function):
     def backward(ctx: Any, d: Tensor) -> tuple[Tensor | None, ...]:
         """Returns the slopes by rows, by what is added, by weight and bias."""
         rows, add, weight, bias = ctx.saved_tensors
-        learns = ctx.needs_input_grad[2]
-        dx, (by_weight, by_bias, by_add) = normed_back(d.contiguous(), rows, add, weight, bias, ctx.eps, learns)
+        learns = any(ctx.needs_input_grad[1:4])
+        dx, total = normed_back(d.contiguous(), rows, add, weight, bias, ctx.eps, learns)
         if not learns:
             return dx, None, None, None, None
+        by_weight, by_bias, by_add = total
         return dx, None if add is None else by_add, by_weight, by_bias, None
 
 

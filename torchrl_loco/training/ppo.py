@@ -205,7 +205,8 @@ float own[HEIGHT];  // whose reads are all on their way before the first write
 for (int i = 0; i < HEIGHT; ++i, from += i <= last ? width : 0) own[i] = *from;
 const float center = mean.data[read], spread = wp::sqrt(var.data[read] + 1e-6f);
 for (int i = 0; i < HEIGHT; ++i, to += wide) {{
-  const float value = wp::clamp((own[i] - center) / spread, -limit, limit);
+  float value = (own[i] - center) / spread;
+  if (value == value) value = wp::clamp(value, -limit, limit);  // what is not a number is to be seen
   if (i <= last) *to = column < width ? value : 0.0f;
 }}
 """

@@ -102,7 +102,7 @@ class REPPO(Algorithm):
         self._rows.take(self.actor_optimizer)
         key = self.spaces.actor_key
         loc, scale = self._policy(self._normalised(td[key], self.norms[key]))
-        explores = exploration_type() in (ExplorationType.RANDOM, None)
+        explores = exploration_type() is ExplorationType.RANDOM
         before_tanh = torch.addcmul(loc, scale, torch.randn_like(loc)) if explores else loc
         return td.update({"loc": loc, "scale": scale, "action": before_tanh.tanh() * self.action_bound})
 

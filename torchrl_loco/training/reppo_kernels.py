@@ -50,7 +50,8 @@ def _entropy(
 ):
     row, ks = tl.program_id(0).to(tl.int64), tl.arange(0, block_k)
     xs, shares, log_total = _softmax(logits, row, bins, logits_row, block_k)
-    center = tl.minimum(tl.maximum(tl.load(returns + row * returns_row), low), high)
+    center = tl.load(returns + row * returns_row)
+    center = tl.where(center < low, low, tl.where(center > high, high, center))  # what is not a number stays
     below = tl.erf((tl.load(edges + ks, ks < bins, 0.0) - center) * scale)
     above = tl.erf((tl.load(edges + ks + 1, ks < bins, 0.0) - center) * scale)
     whole = tl.erf((tl.load(edges + bins) - center) * scale) - tl.erf((tl.load(edges) - center) * scale)
@@ -76,11 +77,13 @@ def _mean_back(d, logits, centers, dx, bins, logits_row, block_k: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["weights_row"])
-def _error(found, wanted, weights, losses, slopes, width, wanted_row, weights_row, block_k: tl.constexpr):
+def _squared_error(
+    found, wanted, weights, losses, slopes, width, found_row, wanted_row, weights_row, block_k: tl.constexpr
+):  # fmt: skip
     row, ks = tl.program_id(0).to(tl.int64), tl.arange(0, block_k)
     places, inside = row * width + ks, ks < width
     aim = tl.load(wanted + row * wanted_row + ks, inside, 0.0).to(tl.float32)
-    error = tl.load(found + places, inside, 0.0).to(tl.float32) - aim
+    error = tl.load(found + row * found_row + ks, inside, 0.0).to(tl.float32) - aim
     weight = tl.load(weights + row * weights_row) / width
     tl.store(losses + row, weight * tl.sum(error * error, 0))
     tl.store(slopes + places, (2.0 * weight * error).to(slopes.dtype.element_ty), inside)
@@ -124,7 +127,7 @@ def _draw_back(
 
 
 @triton.jit(do_not_specialize=["old_row", "old_scale_row"])
-def _near(
+def _actor_loss(
     old_loc, old_scale, loc, scale, log_prob, value, temperature, kl_weight, bound,
     numbers, by_loc, by_scale, by_log_prob, by_value, n, nu, old_row, old_scale_row,
     block_n: tl.constexpr, block_k: tl.constexpr,
@@ -189,11 +192,13 @@ def mean_back(d: Tensor, logits: Tensor, centers: Tensor, start: Callable[..., N
     return dx
 
 
-def error(found: Tensor, wanted: Tensor, weights: Tensor, start: Callable[..., None] = run) -> tuple[Tensor, Tensor]:
+def squared_error(
+    found: Tensor, wanted: Tensor, weights: Tensor, start: Callable[..., None] = run
+) -> tuple[Tensor, Tensor]:
     """Returns mean squared errors of rows ``(n, width)``, times weights ``(n,)``, and their slopes by ``found``."""
-    losses, slopes = found.new_empty(len(found), dtype=torch.float32), torch.empty_like(found)
-    args = found, wanted, weights, losses, slopes, found.shape[1], wanted.stride(0), weights.stride(0)
-    start(_error, (len(found),), args, _block(found.shape[1]))
+    losses, slopes = found.new_empty(len(found), dtype=torch.float32), found.new_empty(found.shape)
+    args = found, wanted, weights, losses, slopes, found.shape[1], found.stride(0), wanted.stride(0), weights.stride(0)
+    start(_squared_error, (len(found),), args, _block(found.shape[1]))
     return losses, slopes
 
 
@@ -214,7 +219,7 @@ def draw_back(
     return slopes
 
 
-def near(
+def actor_loss(
     old: tuple[Tensor, Tensor],
     own: tuple[Tensor, Tensor],
     log_prob: Tensor,
@@ -232,7 +237,7 @@ def near(
     n, nu = own[0].shape
     numbers, slopes = value.new_empty(4, n), tuple(map(torch.empty_like, (*own, log_prob, value)))
     args = *old, *own, log_prob, value, *weights, bound, numbers, *slopes, n, nu, old[0].stride(0), old[1].stride(0)
-    start(_near, _grid(n), args, _rows(nu))
+    start(_actor_loss, _grid(n), args, _rows(nu))
     return numbers, slopes
 
 
@@ -305,7 +310,7 @@ class Draw(torch.autograd.Function):
         return *draw_back(by_action.contiguous(), by_log_prob.contiguous(), *ctx.saved_tensors), None
 
 
-class Near(torch.autograd.Function):
+class ActorLoss(torch.autograd.Function):
     """The actor's loss, which goes back to the old policy where it is too far, and what is told of it."""
 
     @staticmethod
@@ -313,7 +318,7 @@ class Near(torch.autograd.Function):
         ctx: Any, loc: Tensor, scale: Tensor, log_prob: Tensor, value: Tensor, old: Any, weights: Any, bound: float
     ) -> tuple[Tensor, Tensor]:
         """Returns the mean loss, a scalar, and the means of all four numbers, ``(4,)``."""
-        numbers, slopes = near(old, (loc, scale), log_prob, value, weights, bound)
+        numbers, slopes = actor_loss(old, (loc, scale), log_prob, value, weights, bound)
         ctx.save_for_backward(*slopes)
         means = numbers.mean(1)
         ctx.mark_non_differentiable(means)
@@ -325,15 +330,18 @@ class Near(torch.autograd.Function):
         return *torch._foreach_mul(ctx.saved_tensors, d), None, None, None
 
 
-def compile_ahead(bins: Any, like: Tensor, n: int, width: int, nu: int) -> None:
-    """Compiles it for ``n`` steps, features of a width and ``nu`` actions; networks have the type of ``like``."""
+def compile_ahead(bins: Any, like: Tensor, n: int, width: int, reads: int, nu: int) -> None:
+    """Compiles it for ``n`` steps, a width of features, ``reads`` numbers and ``nu`` actions, typed as ``like``."""
     count, one = len(bins.centers), like.new_empty(n, dtype=torch.float32)
     logits = like.new_empty(n, count + -count % ALIGNED)[:, :count]  # as rows.Affine gives them
     rows, actions = like.new_empty(n, width), one.new_empty(n, nu)
+    joined(
+        like.new_empty(n, reads + -reads % ALIGNED), actions, reads, reads + nu + -(reads + nu) % ALIGNED, compile_only
+    )
     entropy(logits, one, bins, compile_only)
     mean(logits, bins.centers, compile_only)
     mean_back(one, logits, bins.centers, compile_only)
-    error(rows, rows, one, compile_only)
+    squared_error(rows, rows, one, compile_only)
     draw(actions, actions, actions, compile_only)
     draw_back(actions, one, actions, actions, actions, compile_only)
-    near((actions, actions), (actions, actions), one, one, (one, one), 0.1, compile_only)
+    actor_loss((actions, actions), (actions, actions), one, one, (one, one), 0.1, compile_only)

@@ -1,4 +1,4 @@
-"""REPPO's networks and the critic's losses on CUDA by kernels that are there at once; torch.compile takes seconds."""
+"""REPPO's networks and losses on CUDA by kernels that are there at once; torch.compile takes seconds."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ class ReppoRows:
         like, nu = last.weight.new_empty(0, dtype=dtype), first.in_features - sizes[1]
         with triton_kernels("mlp").all_at_once(like.device):
             of_norms.compile_ahead({part.normalized_shape[-1] for part in norms}, like, n)
-            self._kernels.compile_ahead(critic.bins, like, n, last.out_features, nu)
+            self._kernels.compile_ahead(critic.bins, like, n, last.out_features, sizes[1], nu)
 
     def take(self, *optimizers: FlatAdam) -> None:
         """Computes with the weights that optimizers have now; gradients flow to those that require them."""
@@ -72,7 +72,7 @@ class ReppoRows:
         found, kernels = self._features(rows, action), self._kernels
         logits, predicted = self._value(found, self._weights), self._predictor(found, self._weights)
         loss = kernels.MeanLoss.apply(logits, *kernels.entropy(logits.detach(), returns, self._bins))
-        return loss, kernels.MeanLoss.apply(predicted, *kernels.error(predicted.detach(), features, alive))
+        return loss, kernels.MeanLoss.apply(predicted, *kernels.squared_error(predicted.detach(), features, alive))
 
     def sample(self, loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Returns actions and their log-probabilities as :func:`.reppo.sample` does."""
@@ -89,7 +89,7 @@ class ReppoRows:
         bound: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Returns what :func:`.reppo.actor_losses` does."""
-        loss, numbers = self._kernels.Near.apply(*own, log_prob, value, old, weights, bound)
+        loss, numbers = self._kernels.ActorLoss.apply(*own, log_prob, value, old, weights, bound)
         return loss, *numbers[1:].unbind()
 
     def _features(self, rows: Tensor, action: Tensor) -> Tensor:

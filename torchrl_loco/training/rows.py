@@ -61,9 +61,11 @@ class Rows:
     ) -> Tensor:
         """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well.
 
-        Kernels of Triton write slopes by the weights into so many ``parts`` of the gradient as they ask for.
+        Kernels of Triton write slopes by the weights into so many ``parts`` of the gradient as they ask for; without
+        parts they compute only where there are no gradients.
         """
-        if self.in_triton and (parts is None or all(part.requires_grad for part in self._parameters)):
+        learns = torch.is_grad_enabled() if parts is None else not all(part.requires_grad for part in self._parameters)
+        if self.in_triton and not learns:
             mlp, flat = triton_kernels("mlp"), rows.reshape(-1, rows.shape[-1])
             if len(flat) * max(flat.stride(0), *map(len, self._parameters)) < mlp.MOST:
                 into = None if parts is None else parts(mlp.PARTS)
@@ -91,6 +93,7 @@ class Rows:
             elif isinstance(layer, nn.Linear):
                 left = own.pop("bias", None) if index + 1 in self._normed else None
                 rows = Affine.apply(rows, own["weight"], own.get("bias"))
+                rows = rows if rows.shape[-1] == len(own["weight"]) else rows[..., : len(own["weight"])]
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
@@ -99,23 +102,22 @@ class Rows:
 class Affine(torch.autograd.Function):
     """A linear layer whose bias gets its gradient from a product of matrices: torch's sums take three times as long.
 
-    On CUDA it computes with a multiple of ``ALIGNED`` outputs, of which zeros are left out.
+    On CUDA it computes a multiple of ``ALIGNED`` outputs; those beyond its own are zero.
     """
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Returns what the layer gives, shape ``(..., outputs)``."""
-        ctx.outputs, ctx.more = len(weight), -len(weight) % ALIGNED if rows.is_cuda else 0
-        if ctx.more:
-            weight, bias = pad(weight, (0, 0, 0, ctx.more)), None if bias is None else pad(bias, (0, ctx.more))
+        ctx.outputs, more = len(weight), -len(weight) % ALIGNED if rows.is_cuda else 0
+        if more:
+            weight, bias = pad(weight, (0, 0, 0, more)), None if bias is None else pad(bias, (0, more))
         ctx.save_for_backward(rows, weight)
-        return nn.functional.linear(rows, weight, bias)[..., : ctx.outputs]
+        return nn.functional.linear(rows, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """Returns the slopes by rows, weight and bias."""
         (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
-        slope = pad(slope, (0, ctx.more)) if ctx.more else slope
         flat, n = slope.reshape(-1, slope.shape[-1]), slope.shape[:-1].numel()
         of_weight = (flat.mT @ rows.reshape(n, -1))[: ctx.outputs] if by_weight else None
         of_bias = (flat.new_ones(1, n) @ flat)[0, : ctx.outputs] if by_bias else None
@@ -137,7 +139,7 @@ def normed_silus(layers: Sequence[nn.Module]) -> Iterator[int]:
 
 
 def triton_kernels(name: str) -> ModuleType:
-    """Returns a module of kernels, ``mlp`` or ``normed``, which imports Triton."""
+    """Returns a module of kernels, ``mlp``, ``normed`` or ``reppo_kernels``, which imports Triton."""
     return importlib.import_module(f"torchrl_loco.training.{name}")
 
 
