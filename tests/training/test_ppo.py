@@ -218,7 +218,7 @@ def test_advantages_are_normalised():
 def check_standardised(device):
     """Rows of any length, beside other numbers; a row of one has no deviation."""
     for size in (1, 7, 10_000):
-        whole = 1e3 + torch.randn(3 * size, 5, device=device)
+        whole = 3.0 + torch.randn(3 * size, 5, device=device)
         numbers, others = whole[:, 1].view(3, size), whole[:, 2:].clone()
         expected = numbers.double() - numbers.double().mean(1, keepdim=True)
         if size > 1:
