@@ -364,7 +364,7 @@ def standardise(numbers: Tensor) -> None:
         spread, center = torch.std_mean(numbers, 1, correction=min(1, numbers.shape[1] - 1), keepdim=True)
         numbers.sub_(center).div_(spread.clamp(min=1e-6))  # one has no deviation
         return
-    (rows, count), lanes = numbers.shape, 32
+    (rows, count), lanes = numbers.shape, lanes_of(numbers.device)
     moments = numbers.new_empty(rows, lanes, 2, dtype=torch.float64)
     launch(moments_of_parts, (rows, lanes * lanes), [numbers, lanes], [moments])
     launch(standardise_by, (rows, -(-count // lanes) * lanes), [moments, lanes], [numbers])

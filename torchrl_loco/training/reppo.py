@@ -72,8 +72,8 @@ class REPPO(Algorithm):
         self._q: ReppoRows | DistributionalQ = self.critic
         if not spaces.pixels and triton_works(self.device):
             sizes, dtype = (spaces.observation, spaces.critic), torch.bfloat16 if config.bf16 else torch.float32
-            parts = nn.Sequential(*layers), extract, self.critic, sizes, dtype
-            self._rows = self._q = ReppoRows(*parts, config.minibatch_size)
+            actor = nn.Sequential(*layers)
+            self._rows = self._q = ReppoRows(actor, extract, self.critic, sizes, dtype, config.minibatch_size)
             self.critic_optimizer.compile_with([(normalise_of(dtype), LARGE), (choose, LARGE)])
             self._policy = self._rows.distribution
         self._fused_values = self.fused(self._values, "actor and critic", config.bf16)

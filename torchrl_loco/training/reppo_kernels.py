@@ -23,15 +23,11 @@ ROWS = 16  # that a block of threads has at once, where they are short
 def _joined(
     left, right, out, n, reads, count, width, left_row, right_row, block_n: tl.constexpr, block_k: tl.constexpr
 ):  # fmt: skip
-    rows, ks = (
-        (tl.program_id(0) * block_n + tl.arange(0, block_n)).to(tl.int64)[:, None],
-        tl.arange(0, block_k)[None, :],
-    )
-    first, at = (rows < n) & (ks < reads), ks - reads
-    behind = (rows < n) & (at >= 0) & (at < count)
-    both = tl.load(left + rows * left_row + ks, first, 0.0).to(tl.float32)
-    both += tl.load(right + rows * right_row + at, behind, 0.0).to(tl.float32)
-    tl.store(out + rows * width + ks, both.to(out.dtype.element_ty), (rows < n) & (ks < width))
+    _, at, ks, inside = _places(n, width, block_n, block_k)
+    behind = inside & (ks >= reads) & (ks < reads + count)
+    both = tl.load(left + at * left_row + ks, inside & (ks < reads), 0.0).to(tl.float32)
+    both += tl.load(right + at * right_row + ks - reads, behind, 0.0).to(tl.float32)
+    tl.store(out + at * width + ks, both.to(out.dtype.element_ty), inside)
 
 
 @triton.jit
@@ -162,7 +158,7 @@ def joined(rows: Tensor, action: Tensor, reads: int, width: int, start: Callable
     """Returns the first ``reads`` numbers of rows ``(n, k)``, then actions ``(n, nu)``, then zeros, ``(n, width)``."""
     n, out = len(rows), rows.new_empty(len(rows), width)
     args = rows, action, out, n, reads, action.shape[1], width, rows.stride(0), action.stride(0)
-    start(_joined, (triton.cdiv(n, 16),), args, {"block_n": 16, **_block(width, 4)})
+    start(_joined, _grid(n), args, {"block_n": ROWS, **_block(width, 4)})
     return out
 
 
@@ -220,8 +216,8 @@ def draw_back(
 
 
 def actor_loss(
-    old: tuple[Tensor, Tensor],
     own: tuple[Tensor, Tensor],
+    old: tuple[Tensor, Tensor],
     log_prob: Tensor,
     value: Tensor,
     weights: tuple[Tensor, Tensor],
@@ -230,7 +226,7 @@ def actor_loss(
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Returns numbers of the actor's loss, ``(4, n)``, and the slopes of its mean.
 
-    ``old`` and ``own`` are means and deviations ``(n, nu)``, log-probabilities and values ``(n,)``, and ``weights``
+    ``own`` and ``old`` are means and deviations ``(n, nu)``, log-probabilities and values ``(n,)``, and ``weights``
     temperature and weight of the divergence. The numbers are loss, entropy, divergence and whether that is beyond the
     bound. Slopes are by ``own``, by log-probabilities and values.
     """
@@ -318,7 +314,7 @@ class ActorLoss(torch.autograd.Function):
         ctx: Any, loc: Tensor, scale: Tensor, log_prob: Tensor, value: Tensor, old: Any, weights: Any, bound: float
     ) -> tuple[Tensor, Tensor]:
         """Returns the mean loss, a scalar, and the means of all four numbers, ``(4,)``."""
-        numbers, slopes = actor_loss(old, (loc, scale), log_prob, value, weights, bound)
+        numbers, slopes = actor_loss((loc, scale), old, log_prob, value, weights, bound)
         ctx.save_for_backward(*slopes)
         means = numbers.mean(1)
         ctx.mark_non_differentiable(means)

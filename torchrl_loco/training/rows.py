@@ -43,9 +43,9 @@ class Rows:
             self._layers = layers if torch.allclose(found, expected, rtol=1e-4, atol=1e-5) else self._layers
         self._parameters = list(network.parameters())
         fits = dtype == torch.bfloat16 and not self._encoder and are_linear_and_silu(self._layers, self._parameters)
-        device = self._parameters[0].device
+        normed, device = set(normed_silus(self._layers)), self._parameters[0].device
         self.in_triton = fits and triton_works(device)
-        self._normed = set(normed_silus(self._layers)) if triton_works(device) else set()
+        self._normed = normed if normed and triton_works(device) else set()
 
     def own(self, weights: Mapping[nn.Parameter, Tensor]) -> list[Tensor]:
         """Returns its own of the weights; rows of those after the first are as short as what they multiply."""
@@ -92,8 +92,8 @@ class Rows:
                 left = None
             elif isinstance(layer, nn.Linear):
                 left = own.pop("bias", None) if index + 1 in self._normed else None
-                rows = Affine.apply(rows, own["weight"], own.get("bias"))
-                rows = rows if rows.shape[-1] == len(own["weight"]) else rows[..., : len(own["weight"])]
+                rows, outputs = Affine.apply(rows, own["weight"], own.get("bias")), len(own["weight"])
+                rows = rows if rows.shape[-1] == outputs else rows[..., :outputs]  # backward, a slice is copied
             else:
                 rows = functional_call(layer, own, (rows,))
         return rows
