@@ -90,7 +90,10 @@ main(["train", "walker_stand", "--device=cpu", "--out", sys.argv[1]])
 
 @pytest.mark.ci
 def test_torchs_compiler_is_imported_when_somebody_compiles(tmp_path):
-    """Not by a training with PPO or by hooks; what tensordict and TorchRL asked of it at their import is done then."""
+    """Not by a training or by hooks; what tensordict and TorchRL asked of it at their import is done then.
+
+    Nor is sympy, of which its symbolic shapes are made: they are asked about plain numbers, which is answered alike.
+    """
     code = """
 import sys
 import hook_tasks
@@ -98,10 +101,28 @@ import quickly
 from torchrl_loco import training
 sizes = {"num_envs": 4, "num_steps": 8, "minibatch_size": 16, "epochs": 1, "hidden": (8,), "total_frames": 256}
 settings = {**sizes, "eval_episodes": 2, "video_seconds": 0.0, "logger": ("csv",)}
-training.train("walker_stand", device="cpu", out=sys.argv[1], algorithm="ppo", episode_length=40, **settings)
+for algorithm in "ppo", "reppo":
+    training.train("walker_stand", device="cpu", out=sys.argv[1], algorithm=algorithm, episode_length=40, **settings)
 hook_tasks.FollowVelocity(4, "cpu", 0)
-assert "torch._dynamo" not in sys.modules
+assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
 import torch, tensordict.base
+from torch.fx.experimental import symbolic_shapes as stand_in
+from torch.fx.experimental.symbolic_shapes import expect_true, is_nested_int, sym_eq, sym_or
+questions = {
+    **dict.fromkeys(("expect_true", "guard_bool", "guard_or_false", "guard_size_oblivious"), [(True,), (False,)]),
+    **dict.fromkeys(("guard_int", "guarding_hint_or_throw", "has_guarding_hint", "is_nested_int"), [(0,), (7,)]),
+    **dict.fromkeys(("sym_and", "sym_or"), [(False, True), (True, True), (False,)]),
+    "sym_eq": [((2, 3), torch.Size([2, 3])), ([2], [2, 3]), (4, 5)],
+}
+answers = {(name, i): getattr(stand_in, name)(*args) for name in questions for i, args in enumerate(questions[name])}
+assert "sympy" not in sys.modules
+symbol = torch.fx.experimental.symbolic_shapes.ShapeEnv().create_unbacked_symint()
+real = sys.modules["torch.fx.experimental.symbolic_shapes"]
+assert real is torch.fx.experimental.symbolic_shapes is not stand_in and stand_in.ShapeEnv is real.ShapeEnv
+for (name, i), answer in answers.items():
+    assert getattr(real, name)(*questions[name][i]) is answer, name
+assert isinstance(sym_eq((symbol, 2), (3, 2)), torch.SymBool) and isinstance(sym_or(symbol > 1, False), torch.SymBool)
+assert is_nested_int(symbol) is False
 from torchrl.modules.distributions import utils
 before = torch.compiler.allow_in_graph, torch.compiler.disable
 assert torch.compiler.disable(lambda x: x + 1.0)(torch.ones(())) == 2.0
@@ -112,8 +133,8 @@ assert before[0](later) is later and id(later) in trace_rules._allowed_callable_
 assert before[1](fn=abs)(-2) == 2
 assert id(tensordict.base._foreach_copy_) in trace_rules._allowed_callable_ids
 assert any(getattr(value, "_dynamo_marked_constant", False) for value in vars(utils).values())
-doubled = torch.compile(lambda x: 2 * x, backend="eager")
-assert doubled(torch.ones(2)).sum() == 4.0
+doubled = torch.compile(lambda x: 2 * x, backend="aot_eager", dynamic=True)
+assert doubled(torch.ones(2)).sum() == 4.0 and doubled(torch.ones(3)).sum() == 6.0
 """
     command = [sys.executable, "-c", code, tmp_path]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parent)

@@ -1,6 +1,8 @@
 """torch's compiler, imported when somebody compiles: tensordict asks for it at its import, which takes two seconds.
 
 tensordict and TorchRL only mark functions for it. The marks are noted, and made as soon as the compiler is imported.
+Its symbolic shapes, whose import takes as long again (sympy), torch asks about plain numbers too, in gradients and in
+layers without initial weights: a stand-in answers until somebody asks for more.
 
 torch's own import of it is not safe in two threads at once: a program whose threads compile, or make optimizers of
 torch, imports ``torch._dynamo`` before it starts them.
@@ -9,8 +11,9 @@ torch, imports ``torch._dynamo`` before it starts them.
 import functools
 import importlib
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from importlib.abc import MetaPathFinder
+from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import FunctionType, ModuleType
 from typing import Any
@@ -19,9 +22,26 @@ COMPILER = "torch._dynamo"
 MARKS = "allow_in_graph", "assume_constant_result"
 """Functions of the compiler that note something of a function, and return it."""
 
+SHAPES = "torch.fx.experimental.symbolic_shapes"
+_THE_NUMBER = (
+    *("expect_true", "guard_bool", "guard_int", "guard_or_false", "guard_or_true", "guard_size_oblivious"),
+    *("guarding_hint_or_throw", "size_hint", "statically_known_true"),
+)
+PLAIN: dict[str, Callable[..., Any]] = {
+    **dict.fromkeys(_THE_NUMBER, lambda number, *_: number),
+    **dict.fromkeys(("has_guarding_hint", "has_hint"), lambda number: True),
+    "is_nested_int": lambda number: False,
+    "sym_and": lambda *known: all(known),
+    "sym_or": lambda *known: any(known),
+    "sym_eq": lambda one, other: tuple(one) == tuple(other) if isinstance(one, tuple | list) else one == other,
+}
+"""What functions of symbolic shapes return for plain numbers and sizes, as torch 2.11 to 2.13 asks for them."""
+
 _marked: list[tuple[str, Callable[..., Any]]] = []
 _own: dict[str, Callable[..., Any]] = {}  # functions of torch.compiler that ours stand for
 _is_imported = False
+_stands_in = True  # for symbolic shapes
+_one_at_a_time = threading.RLock()
 
 
 def put_off() -> None:
@@ -31,10 +51,12 @@ def put_off() -> None:
 
 
 class _Finder(MetaPathFinder):
-    """Sees when tensordict is about to be imported, and when the compiler is."""
+    """Sees when tensordict is about to be imported, and when the compiler or its symbolic shapes are."""
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Returns the module's spec if it is the compiler, and leaves all else to others."""
+        """Returns the spec of the compiler, or of what stands in for its shapes, and leaves all else to others."""
+        if name == SHAPES and _stands_in:
+            return ModuleSpec(name, _LoaderOfShapes())
         if name == "tensordict" and COMPILER not in sys.modules and not _own:
             _stand_in()
         if name != COMPILER or not _own or (spec := PathFinder.find_spec(name, path, target)) is None:
@@ -88,3 +110,39 @@ class _Stub(ModuleType):
         if name in MARKS:
             return functools.partial(_mark, name)
         return getattr(importlib.import_module(COMPILER), name)
+
+
+class _LoaderOfShapes(Loader):
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return _Shapes(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        pass
+
+
+class _Shapes(ModuleType):
+    """Symbolic shapes, which are imported when more is asked than what plain numbers need."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name in PLAIN:
+            return functools.partial(_answer, name)
+        if name.startswith("__"):  # many look through all modules for such
+            raise AttributeError(name)
+        return getattr(_symbolic_shapes(), name)
+
+
+def _answer(name: str, *args: Any, **kwargs: Any) -> Any:
+    sizes = [each if isinstance(each, tuple | list) else (each,) for each in args]
+    if not kwargs and all(type(number) in (bool, int) for size in sizes for number in size):
+        return PLAIN[name](*args)
+    return getattr(_symbolic_shapes(), name)(*args, **kwargs)
+
+
+def _symbolic_shapes() -> ModuleType:
+    """Returns the module itself, in the place of what stood in for it."""
+    global _stands_in
+    with _one_at_a_time:
+        _stands_in = False
+        if isinstance(sys.modules.get(SHAPES), _Shapes):
+            del sys.modules[SHAPES]
+    return importlib.import_module(SHAPES)

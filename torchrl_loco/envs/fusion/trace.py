@@ -26,7 +26,17 @@ def _searchsorted(row: torch.Tensor, x: Any, *, out_int32: bool = False, right: 
     return decomposition_table[aten.bucketize.Tensor](x, row, out_int32=out_int32, right=right or side == "right")
 
 
-DECOMPOSED = {**decomposition_table, aten.searchsorted.Tensor: _searchsorted}
+def _cross(one: torch.Tensor, other: torch.Tensor, *, dim: int = -1) -> torch.Tensor:
+    """Returns the cross product: torch's own decomposition imports sympy, which takes a second."""
+    one, other = torch.broadcast_tensors(one, other)
+    return one.roll(-1, dim) * other.roll(1, dim) - one.roll(1, dim) * other.roll(-1, dim)
+
+
+DECOMPOSED: dict[Any, Callable[..., Any]] = {
+    **decomposition_table,
+    aten.searchsorted.Tensor: _searchsorted,
+    aten.linalg_cross.default: _cross,
+}
 """Operators of which torch's compilers know what they consist of."""
 
 
