@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +26,8 @@ from torchrl_loco.training.adam import LARGE, FlatAdam, launch
 from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
-WARMUP = 1  # epochs before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles
+WARMUP = 1  # calls before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles
+RECORDED = 4  # gradient steps at most that are recorded as one: to record one takes as long as to make it directly
 ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps begins; rows at one of twice that
 
 
@@ -68,7 +70,7 @@ class Algorithm(ABC):
         on_cuda = self.device.type == "cuda"
         # The longer of two branches goes there (svg's actor), and its kernels first.
         self._stream = torch.cuda.Stream(self.device, priority=-1) if on_cuda else None
-        self._epoch = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
+        self._learn = TorchGraph(self._gradient_steps, self.device, warmup=WARMUP) if on_cuda else self._gradient_steps
 
     @abstractmethod
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -86,7 +88,7 @@ class Algorithm(ABC):
         """
 
     def minibatches(self, steps: TensorDictBase) -> Iterable[TensorDictBase]:
-        """Returns the minibatches of an epoch's shuffled ``steps``, a copy, which it may change."""
+        """Returns the minibatches, some of an epoch's, of shuffled ``steps``, a copy, which it may change."""
         return steps.split(self.config.minibatch_size)
 
     def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
@@ -101,9 +103,10 @@ class Algorithm(ABC):
         return ""
 
     @classmethod
-    def compiles(cls, config: TrainingConfig) -> bool:
-        """Returns whether torch.compile will be needed on CUDA, which takes seconds to be ready."""
-        return getattr(config, "compile", False)
+    def start_compilers(cls, config: TrainingConfig) -> None:
+        """Starts what compiles its kernels on CUDA and takes seconds to be ready."""
+        if getattr(config, "compile", False):
+            start_compiler()
 
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors."""
@@ -146,20 +149,21 @@ class Algorithm(ABC):
         with torch.no_grad():
             data = self.prepare(batch).reshape(-1)
             of_batch = self.batch_metrics(data)
+            # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
+            steps = frames // config.minibatch_size
             if self._data is None:
                 self._data = Packed(data)
-                # A remainder smaller than a minibatch is left out: it would weigh as much as a full one.
-                self._order = self._order.new_zeros(len(data) // config.minibatch_size * config.minibatch_size)
+                self._order = self._order.new_zeros(math.gcd(steps, RECORDED) * config.minibatch_size)
             else:
                 self._data.steps.update_(data)
         self._totals.zero_()
         self.join()
         for order in orders:
-            self._order.copy_(order[: len(self._order)])
-            self._epoch()
+            for part in order[: steps * config.minibatch_size].split(len(self._order)):
+                self._order.copy_(part)
+                self._learn()
         self.learn_moments(batch)  # after the update: the losses need the normalisation used while collecting
-        steps = config.epochs * (len(self._order) // config.minibatch_size)
-        return torch.cat([self._totals / steps, of_batch])
+        return torch.cat([self._totals / (config.epochs * steps), of_batch])
 
     def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:
         """Returns a function of tensors as kernels of torch.compile on CUDA, if the settings ask for that.
@@ -230,15 +234,15 @@ class Algorithm(ABC):
                 group["lr"].fill_(lr)
 
     def _gradient_steps(self) -> None:
-        """Does what is recorded on CUDA: an epoch, by itself."""
+        """Does what is recorded on CUDA: by itself, the gradient steps of ``_order``."""
         assert self._data is not None
         for minibatch in self.minibatches(self._data[self._order]):
             self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])
 
     def release(self) -> None:
         """Forgets the recorded gradient steps: NCCL's communicators wait at their end for graphs that contain them."""
-        if isinstance(self._epoch, TorchGraph):
-            self._epoch.release()
+        if isinstance(self._learn, TorchGraph):
+            self._learn.release()
 
     def begin_anew(self) -> None:
         """Draws parameters as at the start of a run, in place, so that what was recorded stays valid."""

@@ -19,8 +19,8 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
 from torchrl_loco.training.adam import ALIGNED, LARGE, SMALL, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
-from torchrl_loco.training.config import PPOConfig
-from torchrl_loco.training.rows import Rows, triton_kernels
+from torchrl_loco.training.config import PPOConfig, TrainingConfig
+from torchrl_loco.training.rows import Rows, triton_kernels, triton_works
 
 LOWEST_LR, HIGHEST_LR = wp.constant(1e-5), wp.constant(1e-2)  # of a learning rate that follows the divergence
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
@@ -74,6 +74,12 @@ class PPO(Algorithm):
         self.optimizer = self.make_optimizer("actor and critic", parameters)
         self._compile()
         self._written = ("action", "action_log_prob", *("before_tanh",) * spaces.bounded)
+
+    @classmethod
+    def start_compilers(cls, config: TrainingConfig) -> None:
+        """Starts Triton."""
+        if config.bf16 and not config.from_pixels:
+            triton_works(torch.device(config.device))
 
     def _compile(self) -> None:
         """Compiles its kernels all at once, instead of each where it is first launched."""

@@ -81,9 +81,10 @@ class REPPO(Algorithm):
         self._fused_actor_losses = self.fused(self._actor_losses, "the actor", config.bf16)
 
     @classmethod
-    def compiles(cls, config: TrainingConfig) -> bool:
-        """Returns whether torch.compile will be needed on CUDA."""
-        return super().compiles(config) and (config.from_pixels or not triton_works(torch.device(config.device)))
+    def start_compilers(cls, config: TrainingConfig) -> None:
+        """Starts Triton, and torch.compile where it cannot do all."""
+        if not triton_works(torch.device(config.device)) or config.from_pixels:
+            super().start_compilers(config)
 
     def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:
         """Returns a function of tensors as kernels of torch.compile, where there are no others."""

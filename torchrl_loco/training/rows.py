@@ -5,6 +5,7 @@ import functools
 import importlib
 import itertools
 import logging
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import Any
@@ -153,11 +154,14 @@ def triton_works(device: torch.device) -> bool:
     if device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0):
         return False
     try:
-        importlib.import_module("triton").runtime.driver.active.get_current_target()  # which compiles C
+        triton = importlib.import_module("triton")
+        triton.runtime.driver.active.get_current_target()  # which compiles C
     except Exception as error:
         logging.getLogger("torchrl_loco").warning(
             "starts and updates take longer: Triton, which needs Linux and gcc or clang, cannot make kernels here (%s)",
             error,
         )
         return False
+    # Kernels are kept by a hash of Triton itself, which takes half a second.
+    threading.Thread(target=getattr(triton.runtime.cache, "triton_key", int), daemon=True).start()
     return True

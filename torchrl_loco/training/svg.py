@@ -140,7 +140,7 @@ class SVG(Algorithm):
             self._replay.draw_starts()
             self._noise.normal_(generator=self.generator)  # graphs that run at once share the state of torch's own
             self._units.uniform_(generator=self.generator)
-            self._epoch()
+            self._learn()
         self._rounds += rounds
         return self._totals / max(rounds, 1)
 

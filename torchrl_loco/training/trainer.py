@@ -26,7 +26,7 @@ from torchrl_loco.policy import Policy
 from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
-from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks, start_compiler
+from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks
 from torchrl_loco.training.config import check_packages_of
 from torchrl_loco.training.environments import Environments, Given, content_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
@@ -111,8 +111,8 @@ class Trainer:
                 f"{config.control_steps_per_batch} on each of {distributed.ranks()} ranks"
             )
         make_algorithm = given.algorithm or ALGORITHMS[config.algorithm]
-        if torch.device(config.device).type == "cuda" and make_algorithm.compiles(config):
-            start_compiler()  # while the environment's kernels are compiled
+        if torch.device(config.device).type == "cuda":
+            make_algorithm.start_compilers(config)  # while the environment is made
         torch.manual_seed(config.seed)
         first, rank = distributed.is_first(), distributed.rank()
         self.environments = Environments(dataclasses.replace(config, task=run.task), given.env)
