@@ -15,7 +15,7 @@ from small_runs import EPISODE, SMALL, WALKER, made, networks, small_walker, tra
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
-from torchrl_loco import NonFiniteWarning, nan_dump
+from torchrl_loco import NonFiniteWarning, RolloutCollector, nan_dump
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.policy import Policy
 from torchrl_loco.tasks.walker import Walker
@@ -85,7 +85,33 @@ def test_others_resumed_equal_those_uninterrupted(algorithm, action_repeat, tria
     resume(tmp_path / algorithm, monkeypatch, algorithm, action_repeat, trials)
 
 
-def resume(tmp_path, monkeypatch, algorithm, action_repeat, trials):
+@pytest.mark.slow
+@for_each("trials", [1, 3])
+def test_batches_that_are_collected_ahead_change_nothing(trials, tmp_path, monkeypatch):
+    """As CUDA collects them: none goes beyond a trial, and one that waits at Ctrl-C is learned from before the end."""
+    ahead = []
+
+    class GoesOn(Trainer):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            self.collector.__class__ = Replays
+
+        def iterate(self, *args, **kwargs):
+            row = super().iterate(*args, **kwargs)
+            ahead.append(self._ahead is not None)
+            if ahead == [True]:  # the second batch waits for its update
+                signal.raise_signal(signal.SIGINT)
+            return row
+
+    class Replays(RolloutCollector):
+        replays = True
+
+    resume(tmp_path / str(trials), monkeypatch, "ppo", 4, trials, GoesOn)
+    # Ctrl-C comes before or in the second update. A trial ends after each of the first three.
+    assert ahead == ([True, False, True, True, False] if trials == 1 else [False] * 3 + [True, False])
+
+
+def resume(tmp_path, monkeypatch, algorithm, action_repeat, trials, trainer=Trainer):
     """Stopped by Ctrl-C after two of five batches and resumed, a run ends bit for bit where one without a stop does."""
     settings = {"total_frames": 5 * 4 * 8 * action_repeat, "action_repeat": action_repeat, "episode_length": 23}
     settings |= {"trials": trials, "trial_fraction": 0.3}  # each a batch, so that it is stopped after the second
@@ -95,20 +121,21 @@ def resume(tmp_path, monkeypatch, algorithm, action_repeat, trials):
     update, calls = Algorithm.update, iter(range(10))
 
     def press_at_the_second(self, batch, progress):
-        if next(calls) == 1:
+        asked = signal.getsignal(signal.SIGTERM) == signal.SIG_DFL  # a second time would end it at once
+        if next(calls) == 1 and not asked:
             signal.raise_signal(signal.SIGINT)
         return update(self, batch, progress)
 
     with monkeypatch.context() as patch:
         patch.setattr(Algorithm, "update", press_at_the_second)
         with pytest.raises(KeyboardInterrupt):
-            Trainer(stopped).train()
+            trainer(stopped).train()
     assert stopped.load_checkpoint("cpu")["iteration"] == 2
     assert {"metrics.csv", "learning_curve.png"} <= {path.name for path in stopped.path.iterdir()}
 
     torch.manual_seed(99)  # whatever else went on in between
     stopped.append_metrics(dict.fromkeys(stopped.read_metrics(), 1e9))  # and was not saved
-    Trainer(stopped, resume=True).train()
+    trainer(stopped, resume=True).train()
     first, second = whole.load_checkpoint("cpu"), stopped.load_checkpoint("cpu")
     assert_same(first["algorithm"], second["algorithm"])
     assert_same(first["collector"], second["collector"])
@@ -327,7 +354,7 @@ def test_torchs_settings_are_restored(tmp_path, monkeypatch):
     torch.set_num_threads(2)
     try:
         trainer = Trainer(made(tmp_path))
-        monkeypatch.setattr(trainer, "iterate", lambda: seen.append(torch.get_num_threads()) or 1 / 0)
+        monkeypatch.setattr(trainer, "iterate", lambda **_: seen.append(torch.get_num_threads()) or 1 / 0)
         with pytest.raises(ZeroDivisionError):
             trainer.train()
         assert (seen, torch.get_num_threads(), torch.get_float32_matmul_precision()) == ([1], 2, "highest")

@@ -9,7 +9,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,7 @@ class Trainer:
         self.trials = Trials(config, self.frames_per_iteration, self._begin_trial, self._kept_of_trial, self._restore)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
+        self._returned = 0.0  # time of the last metrics
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._said = 0, set[str]()
         self._alike: float | None = None  # the reward of the last batch, if there was only one
@@ -227,8 +228,13 @@ class Trainer:
                 "stopping after this update, with a checkpoint; Ctrl-C again stops at once" if first else ""
             ) as interrupted,
         ):
+
+            def is_to_be_saved() -> tuple[bool, bool]:
+                """Returns whether the training is to stop, and whether a checkpoint is due."""
+                return interrupted() or distributed.is_orphan(), time.perf_counter() - saved > config.checkpoint_seconds
+
             while self.frames < self.last_frame:
-                row = self.iterate()
+                row = self.iterate(ahead=lambda: not any(is_to_be_saved()))
                 if loggers is not None:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
@@ -247,8 +253,9 @@ class Trainer:
                     if trial_is_over:
                         self.trials.end(self.frames, distributed.from_first(mean))
                         self.episodes.restart()
-                is_late = time.perf_counter() - saved > config.checkpoint_seconds
-                stop, is_late = distributed.any_rank(interrupted() or distributed.is_orphan(), is_late)
+                if self._ahead is not None:  # it is in no checkpoint: the next update is on it
+                    continue
+                stop, is_late = distributed.any_rank(*is_to_be_saved())
                 if stop or is_late:
                     self.save()
                     saved = time.perf_counter()
@@ -300,13 +307,17 @@ class Trainer:
         batches = (self.config.total_frames - self.frames) // self.frames_per_iteration
         return self.frames + batches * self.frames_per_iteration
 
-    def iterate(self) -> dict[str, float]:
+    def iterate(self, ahead: Callable[[], bool] = lambda: False) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once.
+
+        Args:
+            ahead: whether the device may go on with the next batch, asked before the metrics are waited for.
 
         Raises:
             torchrl_loco.training.trainer.NothingToLearnError: no step of it was finite.
         """
-        config, algorithm, start = self.config, self.algorithm, time.perf_counter()
+        config, algorithm = self.config, self.algorithm
+        start = time.perf_counter() if self._ahead is None else self._returned
         batch, ended = self._collect() if self._ahead is None else self._ahead
         self._ahead = None
         for name, kept in self._summed.items():
@@ -321,9 +332,7 @@ class Trainer:
         non_finite = self._base.health()["total", "non_finite"]  # before a batch that is collected ahead changes it
         numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *counts, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
-        self._ahead = self._collected_ahead()
-        numbers = torch.cat([numbers, metrics])
-        means = distributed.mean_of_ranks(numbers).tolist()
+        means = self._read(distributed.mean_of_ranks(torch.cat([numbers, metrics])), ahead)
         self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
         non_finite, spread, ends, mean_reward, *means = means[3:]
         counted, means = means[: len(counts)], means[len(counts) :]
@@ -340,7 +349,8 @@ class Trainer:
         self._ends_at_once = ends == 1.0
         self.frames += self.frames_per_iteration
         self.iteration += 1
-        seconds = time.perf_counter() - start
+        self._returned = time.perf_counter()
+        seconds = self._returned - start
         self.seconds += seconds
         return {
             "iteration": self.iteration,
@@ -358,16 +368,28 @@ class Trainer:
         flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
         return batch, self.episodes.add(after["reward"].squeeze(-1), *flags)
 
-    def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
-        """Returns the next batch if the algorithm lets it be collected while it still updates on the last one.
+    def _read(self, numbers: torch.Tensor, ahead: Callable[[], bool]) -> list[float]:
+        """Returns numbers of the device, which meanwhile goes on with the next batch if that may be collected ahead."""
+        numbers = numbers.to("cpu", non_blocking=True)
+        device = self.algorithm.device
+        copied = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
+        self._ahead = self._collected_ahead() if ahead() else None
+        if copied is not None:
+            copied.synchronize()
+        return numbers.tolist()
 
-        None is before an evaluation, which begins at the stage of what was learned from.
+    def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
+        """Returns the next batch, which CUDA collects from where the algorithm's ``began`` says, or after the update.
+
+        None is before an evaluation, which begins at the stage of what was learned from, and where a trial ends.
         """
         began, frames = self.algorithm.began, self.frames + self.frames_per_iteration
-        if began is None or frames >= self.last_frame or self._evaluates_after(frames):
+        if frames >= self.last_frame or self._evaluates_after(frames) or self.trials.is_over(frames):
             return None
         if not self.collector.replays or distributed.ranks() > 1:
             return None
+        if began is None:
+            return self._collect()
         now = torch.cuda.current_stream(self.algorithm.device)
         with torch.cuda.stream(self._beside):
             began.wait()
