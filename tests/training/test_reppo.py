@@ -34,15 +34,13 @@ def test_critic_begins_at_zero():
     assert value.max() < 1.0
 
 
-def test_soft_returns_by_hand(monkeypatch):
+def test_soft_returns_by_hand():
     """Four steps of one world: an ordinary one, a truncated one, a terminated one, an ordinary one."""
     gamma, lmbda, temperature = 0.9, 0.8, 0.5
     reppo = made(gamma=gamma, lmbda=lmbda, reward_scale=2.0, init_temperature=temperature)
     log_prob = torch.tensor([[-1.0, -2.0, -3.0, -4.0]])
-    monkeypatch.setattr(
-        "torchrl_loco.training.reppo.sample", lambda loc, scale, noise: (torch.zeros(1, 4, 6), log_prob)
-    )
-    reppo.critic.value_and_features = lambda observation, action: (observation[..., 0], torch.zeros(1, 4, 32))
+    reppo._nets.sample = lambda loc, scale, noise: (torch.zeros(1, 4, 6), log_prob)
+    reppo._nets.value_and_features = lambda observation, action: (observation[..., 0], torch.zeros(1, 4, 32))
     reward, next_value = torch.tensor([0.5, 0.25, 1.0, 0.75]), torch.tensor([2.0, 5.0, 7.0, 6.0])
     truncated = torch.tensor([False, True, False, False])
     terminated = torch.tensor([False, False, True, False])
@@ -131,7 +129,7 @@ def test_the_actor_returns_where_the_kl_bound_is_exceeded():
     batch["loc"] += 0.3  # as if the policy that collected had been another
     before = kl(batch["loc"], batch["scale"], *distribution(reppo, batch)).mean()
     data = reppo.prepare(batch).detach().reshape(-1)
-    reppo.critic.value_and_features = lambda observation, action: (1e6 * action.sum(-1), None)
+    reppo._nets.value_and_features = lambda observation, action: (1e6 * action.sum(-1), None)
     for _ in range(20):
         reppo.actor_step(data)
     after = kl(batch["loc"], batch["scale"], *distribution(reppo, batch)).mean()
@@ -146,7 +144,7 @@ def test_the_actor_ascends_value_and_entropy(slope, temperature):
     batch = collected(reppo, 8)
     with torch.no_grad():
         data = reppo.prepare(batch).reshape(-1)
-    reppo.critic.value_and_features = lambda observation, action: (slope * action.sum(-1), None)
+    reppo._nets.value_and_features = lambda observation, action: (slope * action.sum(-1), None)
 
     def now():
         torch.manual_seed(1)

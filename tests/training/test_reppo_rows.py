@@ -10,6 +10,7 @@ from torch import nn
 from torchrl_loco.training import Spaces, preset
 from torchrl_loco.training import reppo as of_reppo
 from torchrl_loco.training.adam import FlatAdam
+from torchrl_loco.training.reppo_rows import ReppoRows
 from torchrl_loco.training.rows import Rows
 
 pytestmark = pytest.mark.gpu
@@ -84,7 +85,7 @@ def test_updates_are_those_of_the_modules(spaces, hidden, kl_bound, monkeypatch)
         torch.manual_seed(0)
         config = preset("walker_stand", "cuda", "reppo", kl_bound=kl_bound, compile=False, bf16=False, **settings)
         reppo = of_reppo.REPPO(config, spaces)
-        assert (reppo._rows is not None) == quick
+        assert isinstance(reppo._nets, ReppoRows) == quick
         sizes = {"observation": 24, **({"privileged": 31} if spaces.privileged else {})}
         for number in range(3):
             torch.manual_seed(number)

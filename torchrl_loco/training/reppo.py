@@ -67,58 +67,45 @@ class REPPO(Algorithm):
         # The gradient of a dual variable's logarithm shrinks with the variable: an eps of 1e-5 would keep it small.
         groups = [{"params": list(self.actor.parameters())}, {"params": list(self.dual.parameters()), "eps": 1e-8}]
         self.actor_optimizer = self.make_optimizer("actor", groups)
-        self._rows: ReppoRows | None = None
-        self._policy: Callable[[Tensor], tuple[Tensor, Tensor]] = self.distribution  # what losses compute with
-        self._q: ReppoRows | DistributionalQ = self.critic
+        self._nets: ReppoRows | Modules = Modules(self.distribution, self.critic)
         if not spaces.pixels and triton_works(self.device):
             sizes, dtype = (spaces.observation, spaces.critic), torch.bfloat16 if config.bf16 else torch.float32
             actor = nn.Sequential(*layers)
-            self._rows = self._q = ReppoRows(actor, extract, self.critic, sizes, dtype, config.minibatch_size)
+            self._nets = ReppoRows(actor, extract, self.critic, sizes, dtype, config.minibatch_size)
             self.critic_optimizer.compile_with([(normalise_of(dtype), LARGE), (choose, LARGE)])
-            self._policy = self._rows.distribution
         self._fused_values = self.fused(self._values, "actor and critic", config.bf16)
-        self._fused_critic_losses = self.fused(self._q.losses, "the critic", config.bf16)
+        self._fused_critic_losses = self.fused(self._nets.losses, "the critic", config.bf16)
         self._fused_actor_losses = self.fused(self._actor_losses, "the actor", config.bf16)
 
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
         """Starts Triton, and torch.compile where it cannot do all."""
-        if not triton_works(torch.device(config.device)) or config.from_pixels:
+        if config.from_pixels or not triton_works(torch.device(config.device)):
             super().start_compilers(config)
 
     def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:
         """Returns a function of tensors as kernels of torch.compile, where there are no others."""
-        return function if self._rows else super().fused(function, what, bf16, **options)
+        return function if isinstance(self._nets, ReppoRows) else super().fused(function, what, bf16, **options)
 
     def acting(self) -> nn.Module:
         """Returns the actor as a policy for collectors, with networks that compute as in gradient steps on CUDA."""
-        if self._rows:
+        if isinstance(self._nets, ReppoRows):
             return Acting(self.actor, self._act, ("loc", "scale", "action"))
         return Acting(self.actor, self.fused(self.actor, "the actor"))
 
     @torch.no_grad()
     def _act(self, td: TensorDictBase) -> TensorDictBase:
         """Returns ``td`` with actions and the distribution that they were drawn from."""
-        assert self._rows is not None
-        self._rows.take(self.actor_optimizer)
+        self._nets.take(self.actor_optimizer)
         key = self.spaces.actor_key
-        loc, scale = self._policy(self._normalised(td[key], self.norms[key]))
+        loc, scale = self._nets.distribution(self._nets.normalised(td[key], self.norms[key]))
         explores = exploration_type() is ExplorationType.RANDOM
         before_tanh = torch.addcmul(loc, scale, torch.randn_like(loc)) if explores else loc
         return td.update({"loc": loc, "scale": scale, "action": before_tanh.tanh() * self.action_bound})
 
-    def _normalised(self, rows: Tensor, norm: ObservationNorm) -> Tensor:
-        """Returns normalised rows as the networks read them."""
-        return self._rows.normalised(rows, norm) if self._rows else norm(rows)
-
-    def _take(self, *optimizers: FlatAdam) -> None:
-        """Computes with the weights that optimizers have now."""
-        if self._rows:
-            self._rows.take(*optimizers)
-
     def _read(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Returns what networks read of a batch, by entry: rows of numbers normalised, pixels as they are."""
-        rows = {key: self._normalised(td[key], norm) for key, norm in self.norms.items()}
+        rows = {key: self._nets.normalised(td[key], norm) for key, norm in self.norms.items()}
         return rows | ({"pixels": td["pixels"]} if self.spaces.pixels else {})
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
@@ -129,7 +116,7 @@ class REPPO(Algorithm):
         """
         config, after = self.config, batch["next"]
         now, later = self._read(batch), self._read(after)
-        self._take(self.actor_optimizer, self.critic_optimizer)
+        self._nets.take(self.actor_optimizer, self.critic_optimizer)
         noise = torch.randn_like(batch["action"])
         observed = later[self.spaces.actor_key], later[self.spaces.critic_key]
         if self.spaces.pixels:  # step by step: a whole batch would fill the memory with what convolutions give
@@ -179,13 +166,14 @@ class REPPO(Algorithm):
 
     def _values(self, observation: Tensor, of_critic: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns log-probability, value and features of one action in each state, made of standard normal noise."""
-        action, log_prob = self._sample(*self._policy(observation), noise)
-        return log_prob, *self._q.value_and_features(of_critic, action)
+        loc, scale = self._nets.distribution(observation)
+        action, log_prob = self._nets.sample(loc, scale, noise)
+        return log_prob, *self._nets.value_and_features(of_critic, action)
 
     def critic_step(self, minibatch: TensorDictBase) -> list[Tensor]:
         """Returns the metrics of the critic, which learns to predict returns and its own features of the next step."""
         names = self.spaces.critic_key, "action", "returns", "features", "alive"
-        self._take(self.critic_optimizer)
+        self._nets.take(self.critic_optimizer)
         loss, aux = self._fused_critic_losses(*(minibatch[name] for name in names))
         self.critic_optimizer.zero_grad()
         (loss + self.config.aux_coeff * aux).backward()
@@ -198,7 +186,7 @@ class REPPO(Algorithm):
         names = self.spaces.critic_key, "loc", "scale"
         noise, observation = torch.randn_like(minibatch["loc"]), self.observed(minibatch)
         with hold_out_net(self.critic):  # gradients pass through it, but not to its parameters
-            self._take(self.actor_optimizer, self.critic_optimizer)
+            self._nets.take(self.actor_optimizer, self.critic_optimizer)
             loss, entropy, divergence, exceeded = self._fused_actor_losses(
                 observation, *(minibatch[name] for name in names), noise, temperature.detach(), kl_weight.detach()
             )
@@ -225,15 +213,11 @@ class REPPO(Algorithm):
 
         All are scalars, of ``n`` steps; the last one is a fraction of them.
         """
-        own = self._policy(observation)
-        action, log_prob = self._sample(*own, noise)
-        value, _ = self._q.value_and_features(of_critic, action)
-        losses = self._rows.actor_losses if self._rows else actor_losses
-        return losses(own, (old_loc, old_scale), log_prob, value, (temperature, kl_weight), self.config.kl_bound)
-
-    def _sample(self, loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns actions and their log-probabilities, as :func:`sample` does."""
-        return self._rows.sample(loc, scale, noise) if self._rows else sample(loc, scale, noise)
+        nets, old, weights = self._nets, (old_loc, old_scale), (temperature, kl_weight)
+        loc, scale = nets.distribution(observation)
+        action, log_prob = nets.sample(loc, scale, noise)
+        value, _ = nets.value_and_features(of_critic, action)
+        return nets.actor_losses((loc, scale), old, log_prob, value, weights, self.config.kl_bound)
 
 
 class DualVariables(nn.Module):
@@ -311,6 +295,21 @@ def actor_losses(
 
 
 # The networks.
+
+
+class Modules:
+    """Actor and critic as modules: from pixels, and where there are no kernels of Triton (see ``ReppoRows``)."""
+
+    def __init__(self, distribution: nn.Module, critic: "DistributionalQ") -> None:
+        self.distribution, self.losses, self.value_and_features = distribution, critic.losses, critic.value_and_features
+        self.sample, self.actor_losses = sample, actor_losses
+
+    def take(self, *optimizers: FlatAdam) -> None:
+        """Computes with the parameters themselves, whose values are always those of now."""
+
+    def normalised(self, rows: Tensor, norm: ObservationNorm) -> Tensor:
+        """Returns normalised rows."""
+        return norm(rows)
 
 
 class ValueBins(nn.Module):
