@@ -10,6 +10,7 @@ torch, imports ``torch._dynamo`` before it starts them.
 
 import functools
 import importlib
+import operator
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -27,12 +28,12 @@ _THE_NUMBER = (
     *("expect_true", "guard_bool", "guard_int", "guard_or_false", "guard_or_true", "guard_size_oblivious"),
     *("guarding_hint_or_throw", "size_hint", "statically_known_true"),
 )
-PLAIN: dict[str, Callable[..., Any]] = {
+_PLAIN: dict[str, Callable[..., Any]] = {
     **dict.fromkeys(_THE_NUMBER, lambda number, *_: number),
     **dict.fromkeys(("has_guarding_hint", "has_hint"), lambda number: True),
     "is_nested_int": lambda number: False,
-    "sym_and": lambda *known: all(known),
-    "sym_or": lambda *known: any(known),
+    "sym_and": lambda *known: functools.reduce(operator.and_, known),
+    "sym_or": lambda *known: functools.reduce(operator.or_, known),
     "sym_eq": lambda one, other: tuple(one) == tuple(other) if isinstance(one, tuple | list) else one == other,
 }
 """What functions of symbolic shapes return for plain numbers and sizes, as torch 2.11 to 2.13 asks for them."""
@@ -40,8 +41,8 @@ PLAIN: dict[str, Callable[..., Any]] = {
 _marked: list[tuple[str, Callable[..., Any]]] = []
 _own: dict[str, Callable[..., Any]] = {}  # functions of torch.compiler that ours stand for
 _is_imported = False
-_stands_in = True  # for symbolic shapes
-_one_at_a_time = threading.RLock()
+_shapes_wait = True
+_one_at_a_time = threading.Lock()  # else a second thread could remove what the first imports
 
 
 def put_off() -> None:
@@ -55,10 +56,10 @@ class _Finder(MetaPathFinder):
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Returns the spec of the compiler, or of what stands in for its shapes, and leaves all else to others."""
-        if name == SHAPES and _stands_in:
+        if name == SHAPES and _shapes_wait and target is None:  # which is a module that is loaded again
             return ModuleSpec(name, _LoaderOfShapes())
         if name == "tensordict" and COMPILER not in sys.modules and not _own:
-            _stand_in()
+            _put_marks_off()
         if name != COMPILER or not _own or (spec := PathFinder.find_spec(name, path, target)) is None:
             return None
         loader: Any = spec.loader
@@ -77,7 +78,7 @@ class _Finder(MetaPathFinder):
         return spec
 
 
-def _stand_in() -> None:
+def _put_marks_off() -> None:
     """Replaces what torch offers for marking, until the compiler is imported."""
     torch: Any = importlib.import_module("torch")
     ours = {"disable": disable, **{name: functools.partial(_mark, name) for name in MARKS}}
@@ -121,12 +122,17 @@ class _LoaderOfShapes(Loader):
 
 
 class _Shapes(ModuleType):
-    """Symbolic shapes, which are imported when more is asked than what plain numbers need."""
+    """Symbolic shapes, which are imported when more is asked than what plain numbers need.
+
+    It answers functions of torch alone, which ask anew at each call: what others keep, they may compile.
+    """
 
     def __getattr__(self, name: str) -> Any:
-        if name in PLAIN:
+        asks = sys._getframe(1)
+        of_torch = asks.f_globals.get("__name__", "").partition(".")[0] == "torch"
+        if name in _PLAIN and of_torch and asks.f_code.co_name != "<module>":
             return functools.partial(_answer, name)
-        if name.startswith("__"):  # many look through all modules for such
+        if name.startswith("__") and name != "__all__":  # many look through all modules for such
             raise AttributeError(name)
         return getattr(_symbolic_shapes(), name)
 
@@ -134,15 +140,15 @@ class _Shapes(ModuleType):
 def _answer(name: str, *args: Any, **kwargs: Any) -> Any:
     sizes = [each if isinstance(each, tuple | list) else (each,) for each in args]
     if not kwargs and all(type(number) in (bool, int) for size in sizes for number in size):
-        return PLAIN[name](*args)
+        return _PLAIN[name](*args)
     return getattr(_symbolic_shapes(), name)(*args, **kwargs)
 
 
 def _symbolic_shapes() -> ModuleType:
     """Returns the module itself, in the place of what stood in for it."""
-    global _stands_in
+    global _shapes_wait
     with _one_at_a_time:
-        _stands_in = False
+        _shapes_wait = False
         if isinstance(sys.modules.get(SHAPES), _Shapes):
             del sys.modules[SHAPES]
     return importlib.import_module(SHAPES)

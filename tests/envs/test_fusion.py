@@ -389,6 +389,12 @@ def test_what_cannot_be_fused_is_named():
             fused(writer(func), with_room(func, operands(5)), 5)
 
 
+@for_each("sizes", [(4, 4), (1, 3)])
+def test_what_torch_refuses_is_its_error(sizes):
+    with pytest.raises(RuntimeError, match=r"linalg\.cross"):
+        trace(lambda arrays: torch.linalg.cross(*(arrays["x"][:, :size] for size in sizes)), operands(5))
+
+
 @for_each("n", [1, 3, 6, 100])
 def test_tensors_of_a_task_are_read_at_each_launch(n):
     """Of each size that may be mistaken for that of the worlds; literals of a hook stay what they are."""
