@@ -378,8 +378,6 @@ def lengths(rows):
 
 @pytest.mark.slow
 def test_a_run_goes_on_without_what_it_remembered(tmp_path, capsys, monkeypatch):
-    """Nor does it learn from a batch that was collected ahead, in which the episodes have gone on."""
-
     def ahead(self):  # as on CUDA
         return self._collect() if self.last_frame - self.frames > self.frames_per_iteration else None
 

@@ -153,6 +153,7 @@ class Algorithm(ABC):
             steps = frames // config.minibatch_size
             if self._data is None:
                 self._data = Packed(data)
+                # As many steps in each recording of an epoch.
                 self._order = self._order.new_zeros(math.gcd(steps, RECORDED) * config.minibatch_size)
             else:
                 self._data.steps.update_(data)

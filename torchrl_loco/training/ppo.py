@@ -20,7 +20,7 @@ from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, 
 from torchrl_loco.training.adam import ALIGNED, LARGE, SMALL, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
 from torchrl_loco.training.config import PPOConfig, TrainingConfig
-from torchrl_loco.training.rows import Rows, triton_kernels, triton_works
+from torchrl_loco.training.rows import Rows, start_triton, triton_kernels
 
 LOWEST_LR, HIGHEST_LR = wp.constant(1e-5), wp.constant(1e-2)  # of a learning rate that follows the divergence
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
@@ -78,8 +78,9 @@ class PPO(Algorithm):
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
         """Starts Triton."""
+        super().start_compilers(config)
         if config.bf16 and not config.from_pixels:
-            triton_works(torch.device(config.device))
+            start_triton(torch.device(config.device))
 
     def _compile(self) -> None:
         """Compiles its kernels all at once, instead of each where it is first launched."""

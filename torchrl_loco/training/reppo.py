@@ -27,7 +27,7 @@ from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_
 from torchrl_loco.training.config import REPPOConfig, TrainingConfig
 from torchrl_loco.training.ppo import normalise_of
 from torchrl_loco.training.reppo_rows import ReppoRows
-from torchrl_loco.training.rows import triton_works
+from torchrl_loco.training.rows import start_triton, triton_works
 
 
 class REPPO(Algorithm):
@@ -80,7 +80,7 @@ class REPPO(Algorithm):
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
         """Starts Triton, and torch.compile where it cannot do all."""
-        if config.from_pixels or not triton_works(torch.device(config.device)):
+        if config.from_pixels or not start_triton(torch.device(config.device)):
             super().start_compilers(config)
 
     def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:

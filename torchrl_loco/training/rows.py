@@ -154,14 +154,19 @@ def triton_works(device: torch.device) -> bool:
     if device.type != "cuda" or torch.cuda.get_device_capability(device) < (8, 0):
         return False
     try:
-        triton = importlib.import_module("triton")
-        triton.runtime.driver.active.get_current_target()  # which compiles C
+        importlib.import_module("triton").runtime.driver.active.get_current_target()  # which compiles C
     except Exception as error:
         logging.getLogger("torchrl_loco").warning(
             "starts and updates take longer: Triton, which needs Linux and gcc or clang, cannot make kernels here (%s)",
             error,
         )
         return False
-    # Kernels are kept by a hash of Triton itself, which takes half a second.
-    threading.Thread(target=getattr(triton.runtime.cache, "triton_key", int), daemon=True).start()
     return True
+
+
+def start_triton(device: torch.device) -> bool:
+    """Returns whether Triton works; it hashes itself meanwhile, by which it names what it keeps: half a second."""
+    works = triton_works(device)
+    if works and (key := getattr(importlib.import_module("triton").runtime.cache, "triton_key", None)):
+        threading.Thread(target=key, daemon=True).start()
+    return works

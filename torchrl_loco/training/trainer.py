@@ -9,7 +9,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ class Trainer:
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
         self._returned = 0.0  # time of the last metrics
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
-        self._non_finite, self._said = 0, set[str]()
+        self._non_finite, self._index_errors, self._said = 0, 0, set[str]()
         self._alike: float | None = None  # the reward of the last batch, if there was only one
         self._ends_at_once = False
         self._best = -math.inf  # the evaluation that selected the policy
@@ -196,8 +196,9 @@ class Trainer:
         """Trains to the last frame, then evaluates the best policy, plots the learning curve and records a video.
 
         A progress bar shows the return (see :class:`torchrl_loco.training.episodes.Episodes`) and the frames per
-        second. At Ctrl-C, SIGTERM or SIGHUP, which a terminal sends when it is closed, the iteration is finished and a
-        checkpoint written before KeyboardInterrupt is raised; a second one stops at once.
+        second. At Ctrl-C, SIGTERM or SIGHUP, which a terminal sends when it is closed, the iteration is finished, and
+        the next if its batch is collected already; then a checkpoint is written before KeyboardInterrupt is raised. A
+        second one stops at once.
 
         Raises:
             KeyboardInterrupt: one of these signals.
@@ -228,13 +229,10 @@ class Trainer:
                 "stopping after this update, with a checkpoint; Ctrl-C again stops at once" if first else ""
             ) as interrupted,
         ):
-
-            def is_to_be_saved() -> tuple[bool, bool]:
-                """Returns whether the training is to stop, and whether a checkpoint is due."""
-                return interrupted() or distributed.is_orphan(), time.perf_counter() - saved > config.checkpoint_seconds
-
+            self._returned = saved  # not when an earlier call ended
+            stop = is_late = False
             while self.frames < self.last_frame:
-                row = self.iterate(ahead=lambda: not any(is_to_be_saved()))
+                row = self.iterate(ahead=not (stop or is_late))
                 if loggers is not None:
                     self.run.append_metrics(row)
                     loggers.log(row, self.frames)
@@ -253,12 +251,13 @@ class Trainer:
                     if trial_is_over:
                         self.trials.end(self.frames, distributed.from_first(mean))
                         self.episodes.restart()
+                is_late = time.perf_counter() - saved > config.checkpoint_seconds
+                stop, is_late = distributed.any_rank(interrupted() or distributed.is_orphan(), is_late)
                 if self._ahead is not None:  # it is in no checkpoint: the next update is on it
                     continue
-                stop, is_late = distributed.any_rank(*is_to_be_saved())
                 if stop or is_late:
                     self.save()
-                    saved = time.perf_counter()
+                    saved, is_late = time.perf_counter(), False
                 if stop:
                     if first:
                         plot_runs([self.run], self.run.path / "learning_curve.png")
@@ -273,7 +272,7 @@ class Trainer:
         """Prints what a user should know after a batch with these metrics, each thing once in a run."""
         notes = {}
         if self._non_finite and "non_finite" not in self._said:
-            lost = int(self._base.health()["total", "index_error"])
+            lost = self._index_errors
             beyond = f"; {lost} steps indexed constants or shared beyond their end" if lost else ""
             what = "episodes have ended because a state, an observation or a reward was not finite"
             notes["non_finite"] = f"{self._non_finite} {what}{beyond}"
@@ -307,11 +306,13 @@ class Trainer:
         batches = (self.config.total_frames - self.frames) // self.frames_per_iteration
         return self.frames + batches * self.frames_per_iteration
 
-    def iterate(self, ahead: Callable[[], bool] = lambda: False) -> dict[str, float]:
+    def iterate(self, ahead: bool = False) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once.
 
+        Their seconds are those of this call; of a batch that was collected ahead, those since the call before.
+
         Args:
-            ahead: whether the device may go on with the next batch, asked before the metrics are waited for.
+            ahead: whether the device may go on with the next batch while the host waits for the metrics.
 
         Raises:
             torchrl_loco.training.trainer.NothingToLearnError: no step of it was finite.
@@ -329,12 +330,20 @@ class Trainer:
         told = {f"metric/{name}": after["metrics", name] for name in self._base.metric_names}
         of_env |= {name: values.nansum() for name, values in told.items()}
         counts = [(~values.isnan()).float().sum() for values in told.values()]
-        non_finite = self._base.health()["total", "non_finite"]  # before a batch that is collected ahead changes it
-        numbers = torch.cat([ended, torch.stack([non_finite, spread, ends, reward, *counts, *of_env.values()])])
+        lost = [self._base.health()["total", name] for name in ("non_finite", "index_error")]
+        numbers = torch.cat([ended, torch.stack([*lost, spread, ends, reward, *counts, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
-        means = self._read(distributed.mean_of_ranks(torch.cat([numbers, metrics])), ahead)
+        numbers = distributed.mean_of_ranks(torch.cat([numbers, metrics])).to("cpu", non_blocking=True)
+        on_cuda = algorithm.device.type == "cuda"
+        copied = torch.cuda.current_stream(algorithm.device).record_event() if on_cuda else None
+        del batch, after  # so that the next one takes their place
+        self._ahead = self._collected_ahead() if ahead else None
+        if copied is not None:
+            copied.synchronize()
+        means = numbers.tolist()
         self.episodes.take(*(mean * distributed.ranks() for mean in means[:3]))
-        non_finite, spread, ends, mean_reward, *means = means[3:]
+        non_finite, index_errors, spread, ends, mean_reward, *means = means[3:]
+        self._index_errors = round(index_errors * distributed.ranks())
         counted, means = means[: len(counts)], means[len(counts) :]
         row = dict(zip((*of_env, *algorithm.metric_names, *algorithm.batch_metric_names), means, strict=True))
         for name, count in zip(told, counted, strict=True):  # over all ranks: each may have another number of steps
@@ -367,16 +376,6 @@ class Trainer:
         after = batch["next"]
         flags = (after[name].squeeze(-1) for name in ("done", "terminated"))
         return batch, self.episodes.add(after["reward"].squeeze(-1), *flags)
-
-    def _read(self, numbers: torch.Tensor, ahead: Callable[[], bool]) -> list[float]:
-        """Returns numbers of the device, which meanwhile goes on with the next batch if that may be collected ahead."""
-        numbers = numbers.to("cpu", non_blocking=True)
-        device = self.algorithm.device
-        copied = torch.cuda.current_stream(device).record_event() if device.type == "cuda" else None
-        self._ahead = self._collected_ahead() if ahead() else None
-        if copied is not None:
-            copied.synchronize()
-        return numbers.tolist()
 
     def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
         """Returns the next batch, which CUDA collects from where the algorithm's ``began`` says, or after the update.
