@@ -1,12 +1,14 @@
 """Policies on disk: small, exact enough, and safe to load."""
 
 import errno
+import importlib.util
 import os
 
 import pytest
 import torch
 from cases import PROTOCOLS
 from safetensors.torch import save_file
+from tensordict import TensorDict
 from torch import nn
 
 import torchrl_loco
@@ -71,6 +73,20 @@ def test_layers_that_a_file_cannot_hold(tmp_path):
         with pytest.raises(TypeError, match=message):
             policy.save(tmp_path / "policy.safetensors")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_it_is_called_as_modules_of_tensordict_are(policy, monkeypatch):
+    """Which look for pandas at each call; it does not."""
+    observation, elsewhere = torch.randn(3, 24), TensorDict(batch_size=3)
+    td = TensorDict({"observation": observation}, batch_size=3)
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib.util, "find_spec", None)
+        assert policy(td, tensordict_out=elsewhere) is elsewhere
+        assert policy(td) is td
+    for action in (td["action"], elsewhere["action"], policy(observation), policy(observation=observation)):
+        assert torch.equal(action, policy.module(observation))
+    with pytest.raises(KeyError, match="observation"):
+        policy(TensorDict())
 
 
 def test_round_trip(policy, shared, tmp_path):

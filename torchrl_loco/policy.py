@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
 from torch import nn
 
 from torchrl_loco import storage
@@ -112,6 +113,15 @@ class Policy(TensorDictModule):
         reads = "pixels" if isinstance(network[0], PixelEncoder) else "observation"
         super().__init__(network, in_keys=[reads], out_keys=["action"])
         self.info = info
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None) -> TensorDictBase:
+        """Returns ``tensordict``, or ``tensordict_out``, with the action; the action alone of an observation.
+
+        tensordict's own looks for pandas at each call, which takes longer than a small network, or imports it.
+        """
+        action = self.module(tensordict[self.in_keys[0]])
+        return (tensordict if tensordict_out is None else tensordict_out).set("action", action)
 
     @property
     def is_bounded(self) -> bool:
