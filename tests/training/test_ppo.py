@@ -94,7 +94,7 @@ def test_the_critic_reads_what_is_privileged():
     ppo = PPO(preset("walker_stand", "cpu", "ppo", total_frames=10_000, **settings), spaces)
     seen = 100.0 + 7.0 * torch.randn(1, 4, 5)
     td = TensorDict({"observation": torch.randn(1, 4, 24), "privileged": seen}, batch_size=[1, 4])
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         td = ppo.acting()(td)
     value = ppo.critic(td.clone())["state_value"]
     flags = {name: torch.zeros(1, 4, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
@@ -131,8 +131,7 @@ def test_what_acts_is_the_actor(bounded):
         distribution = ppo.actor.get_dist(td.clone())
     torch.testing.assert_close(td["action_log_prob"], distribution.log_prob(td["action"]), rtol=1e-4, atol=2e-3)
     assert td["action"].abs().max() <= 1.0 if bounded else td["action"].abs().max() > 5.0
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        action = ppo.acting()(td.clone())["action"]
+    action = ppo.acting()(td.clone())["action"]  # the mode where no type of exploration is set, as TorchRL's actors
     policy = deterministic_policy(ppo.actor, config, {})
     assert policy.is_bounded == bounded
     torch.testing.assert_close(policy(observation=td["observation"]), action)
@@ -156,7 +155,7 @@ def test_gradients_are_those_of_clip_ppo_loss(bounded):
         samples_mc_entropy=1,
     )
     td = TensorDict({"observation": torch.randn(128, 21), "privileged": torch.randn(128, 13)}, batch_size=[128])
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         td = ppo.acting()(td)
     targets = {"advantage": torch.randn(128, 1), "value_target": 2.0 * torch.randn(128, 1)}
     td.update(targets)
@@ -458,7 +457,7 @@ def test_what_is_computed_beside_is_the_same():
             torch.manual_seed(iteration)
             seen = {"observation": torch.randn(256, 8, 21).cuda(), "privileged": torch.randn(256, 8, 13).cuda()}
             td = TensorDict(seen, batch_size=[256, 8]).cuda()
-            with torch.no_grad():
+            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
                 td = ppo.acting()(td)
             ends = {name: torch.zeros(256, 8, 1, dtype=torch.bool).cuda() for name in ("done", "terminated")}
             td["next"] = TensorDict({**seen, "reward": td["action"][..., :1].clone(), **ends}, batch_size=[256, 8])

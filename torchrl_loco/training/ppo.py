@@ -110,7 +110,7 @@ class PPO(Algorithm):
         """Returns ``td`` with actions and their log-probabilities; with what they were before tanh, if bounded."""
         rows = self._read(td, self.spaces.actor_key)
         rows = rows.reshape(-1, *rows.shape[td.ndim :])
-        explores = exploration_type() in (ExplorationType.RANDOM, None)
+        explores = exploration_type() is ExplorationType.RANDOM
         noise = (torch.randn if explores else torch.zeros)(len(rows), self.spaces.action, device=self.device)
         mean = self._mean(rows, self.optimizer.wide(self._dtype))
         values = drawn(mean, self._std(), noise, self.spaces.bounded)
