@@ -13,6 +13,7 @@ from torch import nn
 
 import torchrl_loco
 from torchrl_loco import storage
+from torchrl_loco.collector import rewritten_by
 from torchrl_loco.policy import ObservationNorm, Policy, in_task, shipped_policies
 from torchrl_loco.sim import models
 from torchrl_loco.training import evaluate_policy
@@ -87,6 +88,7 @@ def test_it_is_called_as_modules_of_tensordict_are(policy, monkeypatch):
         assert torch.equal(action, policy.module(observation))
     with pytest.raises(KeyError, match="observation"):
         policy(TensorDict())
+    assert rewritten_by(policy) == {"action"}
 
 
 def test_round_trip(policy, shared, tmp_path):

@@ -109,6 +109,8 @@ class Policy(TensorDictModule):
         info: ``task``, ``protocol``, ``action_repeat``, and further information such as the return.
     """
 
+    reads_in_keys_alone = True  # which collectors ask
+
     def __init__(self, network: nn.Sequential, info: dict[str, Any]) -> None:
         reads = "pixels" if isinstance(network[0], PixelEncoder) else "observation"
         super().__init__(network, in_keys=[reads], out_keys=["action"])
