@@ -21,6 +21,11 @@ SMALL, LARGE = 64, 256
 """Threads of a block: few in kernels with a thread for each step or world, so that all multiprocessors get blocks."""
 
 
+def aligned(count: int) -> int:
+    """Returns ``count`` rounded up to a multiple of ``ALIGNED``."""
+    return count + -count % ALIGNED
+
+
 class FlatAdam:
     """Adam (Kingma and Ba, 2015) that clips the gradients of all parameters together, on one vector for each group.
 
@@ -138,7 +143,7 @@ class Vectors:
             raise TypeError(f"the parameters of networks must be torch.float32, not {', '.join(sorted(others))}")
         self._parts = parameters
         rows = [(part.shape[:-1].numel(), part.shape[-1]) if part.ndim else (1, 1) for part in parameters]
-        self._wide_rows = [(count, size + -size % ALIGNED) for count, size in rows]
+        self._wide_rows = [(count, aligned(size)) for count, size in rows]
         # Of a matrix and its gaps, or of a row and the gap behind it.
         sizes = [
             (count * wide, 0) if part.ndim > 1 else (size, wide - size)

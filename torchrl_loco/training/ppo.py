@@ -14,19 +14,17 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, ValueOperator
 
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.policy import ObservationNorm
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, network_of
-from torchrl_loco.training.adam import ALIGNED, LARGE, SMALL, launch
+from torchrl_loco.training.adam import LARGE, SMALL, launch
 from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
 from torchrl_loco.training.config import PPOConfig, TrainingConfig
-from torchrl_loco.training.rows import Rows, start_triton, triton_kernels
+from torchrl_loco.training.rows import Rows, normalise_of, normalised, start_triton, triton_kernels
 
 LOWEST_LR, HIGHEST_LR = wp.constant(1e-5), wp.constant(1e-2)  # of a learning rate that follows the divergence
 HALF_LOG_2_PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 LOG_2 = wp.constant(math.log(2.0))
 CRITIC_COEFF = 0.5
-HEIGHT = 8  # rows of which a thread normalises a number
 METRICS = 5  # numbers of a step whose means are metrics; the slopes of the deviations follow them
 
 
@@ -200,59 +198,6 @@ def follow(kl: wp.array[float], target: float, lr: wp.array[float]):
     if kl[0] > 2.0 * target:
         factor = 1.0 / 1.5
     lr[0] = wp.clamp(lr[0] * factor, LOWEST_LR, HIGHEST_LR)
-
-
-# In C++, as Warp computes the address of each number from strides anew, and of indices that may be negative.
-NORMALISE = f"""
-const int HEIGHT = {HEIGHT}, width = rows.shape[1], wide = out.shape[1];
-const int first = group * HEIGHT, last = wp::min(HEIGHT, rows.shape[0] - first) - 1, read = wp::min(column, width - 1);
-const float* from = rows.data + size_t(first) * width + read;
-auto* to = out.data + size_t(first) * wide + column;
-float own[HEIGHT];  // whose reads are all on their way before the first write
-for (int i = 0; i < HEIGHT; ++i, from += i <= last ? width : 0) own[i] = *from;
-const float center = mean.data[read], spread = wp::sqrt(var.data[read] + 1e-6f);
-for (int i = 0; i < HEIGHT; ++i, to += wide) {{
-  float value = (own[i] - center) / spread;
-  if (value == value) value = wp::clamp(value, -limit, limit);  // what is not a number is to be seen
-  if (i <= last) *to = column < width ? value : 0.0f;
-}}
-"""
-
-
-# A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
-@functools.cache
-def normalise_of(dtype: torch.dtype) -> wp.Kernel:
-    """Returns the kernel that writes normalised rows; all arrays are contiguous."""
-    Rows: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
-
-    @wp.func_native(NORMALISE)
-    def write(
-        rows: wp.array2d[float],
-        mean: wp.array[float],
-        var: wp.array[float],
-        limit: float,
-        out: Rows,
-        group: int,
-        column: int,
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def normalise(rows: wp.array2d[float], mean: wp.array[float], var: wp.array[float], limit: float, out: Rows):
-        group, column = wp.tid()
-        write(rows, mean, var, limit, out, group, column)
-
-    return normalise
-
-
-@torch.no_grad()
-def normalised(rows: Tensor, norm: ObservationNorm, dtype: torch.dtype) -> Tensor:
-    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``ALIGNED``."""
-    norm.check(rows)
-    wide = rows.new_empty(*rows.shape[:-1], -(-rows.shape[-1] // ALIGNED) * ALIGNED, dtype=dtype)
-    flat, out = rows.reshape(-1, rows.shape[-1]).contiguous(), wide.view(-1, wide.shape[-1])
-    dim = -(-len(out) // HEIGHT), out.shape[1]
-    launch(normalise_of(dtype), dim, [flat, norm.mean, norm.var, norm.limit], [out], LARGE)
-    return wide
 
 
 @wp.func

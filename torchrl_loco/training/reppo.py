@@ -25,9 +25,8 @@ from torchrl_loco.training.actor import Network, Spaces, log_slope, make_actor, 
 from torchrl_loco.training.adam import LARGE, FlatAdam
 from torchrl_loco.training.algorithm import Acting, Algorithm, choose, clip_and_step
 from torchrl_loco.training.config import REPPOConfig, TrainingConfig
-from torchrl_loco.training.ppo import normalise_of
 from torchrl_loco.training.reppo_rows import ReppoRows
-from torchrl_loco.training.rows import start_triton, triton_works
+from torchrl_loco.training.rows import normalise_of, start_triton, triton_works
 
 
 class REPPO(Algorithm):

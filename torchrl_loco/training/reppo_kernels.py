@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from torchrl_loco.training.adam import ALIGNED
+from torchrl_loco.training.adam import aligned
 from torchrl_loco.training.mlp import compile_only, run
 
 HALF_LOG_2_PI, LOG_2 = tl.constexpr(0.5 * math.log(2.0 * math.pi)), tl.constexpr(math.log(2.0))
@@ -310,11 +310,9 @@ class ActorLoss(torch.autograd.Function):
     """The actor's loss, which goes back to the old policy where it is too far, and what is told of it."""
 
     @staticmethod
-    def forward(
-        ctx: Any, loc: Tensor, scale: Tensor, log_prob: Tensor, value: Tensor, old: Any, weights: Any, bound: float
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the mean loss, a scalar, and the means of all four numbers, ``(4,)``."""
-        numbers, slopes = actor_loss((loc, scale), old, log_prob, value, weights, bound)
+    def forward(ctx: Any, loc: Tensor, scale: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
+        """Returns the mean loss, a scalar, and the means of all numbers of :func:`actor_loss`, ``(4,)``."""
+        numbers, slopes = actor_loss((loc, scale), *others)
         ctx.save_for_backward(*slopes)
         means = numbers.mean(1)
         ctx.mark_non_differentiable(means)
@@ -323,17 +321,16 @@ class ActorLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, d: Tensor, _: Any) -> tuple[Tensor | None, ...]:
         """Returns the slopes by means, deviations, log-probabilities and values."""
-        return *torch._foreach_mul(ctx.saved_tensors, d), None, None, None
+        by_loc, by_scale, by_log_prob, by_value = torch._foreach_mul(ctx.saved_tensors, d)
+        return by_loc, by_scale, None, by_log_prob, by_value, None, None
 
 
 def compile_ahead(bins: Any, like: Tensor, n: int, width: int, reads: int, nu: int) -> None:
     """Compiles it for ``n`` steps, a width of features, ``reads`` numbers and ``nu`` actions, typed as ``like``."""
     count, one = len(bins.centers), like.new_empty(n, dtype=torch.float32)
-    logits = like.new_empty(n, count + -count % ALIGNED)[:, :count]  # as rows.Affine gives them
+    logits = like.new_empty(n, aligned(count))[:, :count]  # as rows.Affine gives them
     rows, actions = like.new_empty(n, width), one.new_empty(n, nu)
-    joined(
-        like.new_empty(n, reads + -reads % ALIGNED), actions, reads, reads + nu + -(reads + nu) % ALIGNED, compile_only
-    )
+    joined(like.new_empty(n, aligned(reads)), actions, reads, aligned(reads + nu), compile_only)
     entropy(logits, one, bins, compile_only)
     mean(logits, bins.centers, compile_only)
     mean_back(one, logits, bins.centers, compile_only)

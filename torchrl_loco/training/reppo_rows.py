@@ -6,9 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_loco.policy import ObservationNorm
-from torchrl_loco.training.adam import ALIGNED, FlatAdam
-from torchrl_loco.training.ppo import normalised
-from torchrl_loco.training.rows import Rows, triton_kernels
+from torchrl_loco.training.adam import FlatAdam, aligned
+from torchrl_loco.training.rows import Rows, normalised, triton_kernels
 
 
 class ReppoRows:
@@ -79,21 +78,13 @@ class ReppoRows:
         action, log_prob = self._kernels.Draw.apply(*(each.reshape(-1, each.shape[-1]) for each in (loc, scale, noise)))
         return action.view(loc.shape), log_prob.view(loc.shape[:-1])
 
-    def actor_losses(
-        self,
-        own: tuple[Tensor, Tensor],
-        old: tuple[Tensor, Tensor],
-        log_prob: Tensor,
-        value: Tensor,
-        weights: tuple[Tensor, Tensor],
-        bound: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Returns what :func:`.reppo.actor_losses` does."""
-        loss, numbers = self._kernels.ActorLoss.apply(*own, log_prob, value, old, weights, bound)
+    def actor_losses(self, own: tuple[Tensor, Tensor], *others: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Returns what :func:`.reppo.actor_losses` does, of the same."""
+        loss, numbers = self._kernels.ActorLoss.apply(*own, *others)
         return loss, *numbers[1:].unbind()
 
     def _features(self, rows: Tensor, action: Tensor) -> Tensor:
         flat = (each.reshape(-1, each.shape[-1]) for each in (rows, action))
         reads = self._reads + action.shape[-1]
-        read = self._kernels.Joined.apply(*flat, self._reads, reads + -reads % ALIGNED)
+        read = self._kernels.Joined.apply(*flat, self._reads, aligned(reads))
         return self._encoder(read, self._weights).view(*rows.shape[:-1], -1)

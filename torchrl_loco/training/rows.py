@@ -1,4 +1,7 @@
-"""Networks as functions of rows, with other weights than their own: in another type, or longer by zeros."""
+"""Networks as functions of rows, with other weights than their own: in another type, or longer by zeros.
+
+And the normalised rows that they read.
+"""
 
 import contextlib
 import functools
@@ -11,13 +14,16 @@ from types import ModuleType
 from typing import Any
 
 import torch
+import warp as wp
 from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import pad
 
 from torchrl_loco.encoder import PixelEncoder
-from torchrl_loco.policy import layers_of
-from torchrl_loco.training.adam import ALIGNED
+from torchrl_loco.policy import ObservationNorm, layers_of
+from torchrl_loco.training.adam import LARGE, aligned, launch
+
+HEIGHT = 8  # rows of which a thread normalises a number
 
 
 class Rows:
@@ -109,7 +115,7 @@ class Affine(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Returns what the layer gives, shape ``(..., outputs)``."""
-        ctx.outputs, more = len(weight), -len(weight) % ALIGNED if rows.is_cuda else 0
+        ctx.outputs, more = len(weight), aligned(len(weight)) - len(weight) if rows.is_cuda else 0
         if more:
             weight, bias = pad(weight, (0, 0, 0, more)), None if bias is None else pad(bias, (0, more))
         ctx.save_for_backward(rows, weight)
@@ -123,6 +129,59 @@ class Affine(torch.autograd.Function):
         of_weight = (flat.mT @ rows.reshape(n, -1))[: ctx.outputs] if by_weight else None
         of_bias = (flat.new_ones(1, n) @ flat)[0, : ctx.outputs] if by_bias else None
         return slope @ weight if by_rows else None, of_weight, of_bias
+
+
+# In C++, as Warp computes the address of each number from strides anew, and of indices that may be negative.
+NORMALISE = f"""
+const int HEIGHT = {HEIGHT}, width = rows.shape[1], wide = out.shape[1];
+const int first = group * HEIGHT, last = wp::min(HEIGHT, rows.shape[0] - first) - 1, read = wp::min(column, width - 1);
+const float* from = rows.data + size_t(first) * width + read;
+auto* to = out.data + size_t(first) * wide + column;
+float own[HEIGHT];  // whose reads are all on their way before the first write
+for (int i = 0; i < HEIGHT; ++i, from += i <= last ? width : 0) own[i] = *from;
+const float center = mean.data[read], spread = wp::sqrt(var.data[read] + 1e-6f);
+for (int i = 0; i < HEIGHT; ++i, to += wide) {{
+  float value = (own[i] - center) / spread;
+  if (value == value) value = wp::clamp(value, -limit, limit);  // what is not a number is to be seen
+  if (i <= last) *to = column < width ? value : 0.0f;
+}}
+"""
+
+
+# A kernel is of one type of numbers, in a module of its own: one that is added to a module unloads what graphs replay.
+@functools.cache
+def normalise_of(dtype: torch.dtype) -> wp.Kernel:
+    """Returns the kernel that writes normalised rows; all arrays are contiguous."""
+    Wide: Any = wp.array2d(dtype=wp.dtype_from_torch(dtype))  # noqa: N806
+
+    @wp.func_native(NORMALISE)
+    def write(
+        rows: wp.array2d[float],
+        mean: wp.array[float],
+        var: wp.array[float],
+        limit: float,
+        out: Wide,
+        group: int,
+        column: int,
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def normalise(rows: wp.array2d[float], mean: wp.array[float], var: wp.array[float], limit: float, out: Wide):
+        group, column = wp.tid()
+        write(rows, mean, var, limit, out, group, column)
+
+    return normalise
+
+
+@torch.no_grad()
+def normalised(rows: Tensor, norm: ObservationNorm, dtype: torch.dtype) -> Tensor:
+    """Returns what ``norm`` makes of rows of shape ``(..., n)``, with zeros up to a multiple of ``ALIGNED``."""
+    norm.check(rows)
+    wide = rows.new_empty(*rows.shape[:-1], aligned(rows.shape[-1]), dtype=dtype)
+    flat, out = rows.reshape(-1, rows.shape[-1]).contiguous(), wide.view(-1, wide.shape[-1])
+    dim = -(-len(out) // HEIGHT), out.shape[1]
+    launch(normalise_of(dtype), dim, [flat, norm.mean, norm.var, norm.limit], [out], LARGE)
+    return wide
 
 
 def are_linear_and_silu(layers: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> bool:
