@@ -121,7 +121,10 @@ assert "sympy" not in sys.modules
 from torch.fx.experimental.symbolic_shapes import guard_or_false
 real = sys.modules["torch.fx.experimental.symbolic_shapes"]
 assert real is torch.fx.experimental.symbolic_shapes is not stand_in and stand_in.ShapeEnv is real.ShapeEnv
-assert guard_or_false is real.guard_or_false  # not what it stands for, which whoever keeps it could have compiled
+# Whoever keeps a function may compile it: functions of others and torch's modules at their import get the real one.
+assert guard_or_false is real.guard_or_false and (lambda: stand_in.guard_or_true)() is real.guard_or_true
+exec("kept = module.sym_and", at_import := {"__name__": "torch.module", "module": stand_in})
+assert at_import["kept"] is real.sym_and
 for (name, i), answer in answers.items():
     assert getattr(real, name)(*questions[name][i]) is answer, name
 symbol = real.ShapeEnv().create_unbacked_symint()

@@ -1,8 +1,8 @@
 """torch's compiler, imported when somebody compiles: tensordict asks for it at its import, which takes two seconds.
 
 tensordict and TorchRL only mark functions for it. The marks are noted, and made as soon as the compiler is imported.
-Its symbolic shapes, whose import takes as long again (sympy), torch asks about plain numbers too, in gradients and in
-layers without initial weights: a stand-in answers until somebody asks for more.
+torch asks the compiler's symbolic shapes about plain numbers too, for gradients and for layers without initial weights.
+Their import takes seconds again, as it imports sympy: a stand-in answers until somebody asks for more.
 
 torch's own import of it is not safe in two threads at once: a program whose threads compile, or make optimizers of
 torch, imports ``torch._dynamo`` before it starts them.
@@ -56,7 +56,7 @@ class _Finder(MetaPathFinder):
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Returns the spec of the compiler, or of what stands in for its shapes, and leaves all else to others."""
-        if name == SHAPES and _shapes_wait and target is None:  # which is a module that is loaded again
+        if name == SHAPES and _shapes_wait and target is None:  # a target is a module that is reloaded
             return ModuleSpec(name, _LoaderOfShapes())
         if name == "tensordict" and COMPILER not in sys.modules and not _own:
             _put_marks_off()
@@ -114,6 +114,8 @@ class _Stub(ModuleType):
 
 
 class _LoaderOfShapes(Loader):
+    """Loads the stand-in."""
+
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         return _Shapes(spec.name)
 
@@ -122,9 +124,9 @@ class _LoaderOfShapes(Loader):
 
 
 class _Shapes(ModuleType):
-    """Symbolic shapes, which are imported when more is asked than what plain numbers need.
+    """Stands in for symbolic shapes, which are imported when somebody asks for more than plain numbers need.
 
-    It answers functions of torch alone, which ask anew at each call: what others keep, they may compile.
+    Only functions of torch get its answers: they ask at each call. Other modules may keep a function and compile it.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -138,6 +140,7 @@ class _Shapes(ModuleType):
 
 
 def _answer(name: str, *args: Any, **kwargs: Any) -> Any:
+    """Returns what the function that is named so returns; the module itself is asked where a number is symbolic."""
     sizes = [each if isinstance(each, tuple | list) else (each,) for each in args]
     if not kwargs and all(type(number) in (bool, int) for size in sizes for number in size):
         return _PLAIN[name](*args)

@@ -109,7 +109,7 @@ class Policy(TensorDictModule):
         info: ``task``, ``protocol``, ``action_repeat``, and further information such as the return.
     """
 
-    reads_in_keys_alone = True  # which collectors ask
+    reads_in_keys_alone = True  # so collectors need not zero the action where a world is reset
 
     def __init__(self, network: nn.Sequential, info: dict[str, Any]) -> None:
         reads = "pixels" if isinstance(network[0], PixelEncoder) else "observation"
@@ -118,9 +118,10 @@ class Policy(TensorDictModule):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase, *, tensordict_out: TensorDictBase | None = None) -> TensorDictBase:
-        """Returns ``tensordict``, or ``tensordict_out``, with the action; the action alone of an observation.
+        """Returns ``tensordict``, or ``tensordict_out``, with the action; given an observation, the action alone.
 
-        tensordict's own looks for pandas at each call, which takes longer than a small network, or imports it.
+        tensordict's own method looks for pandas on the disk at each call, which takes as long as a small network, or
+        imports it.
         """
         action = self.module(tensordict[self.in_keys[0]])
         return (tensordict if tensordict_out is None else tensordict_out).set("action", action)

@@ -304,6 +304,16 @@ def test_a_remainder_smaller_than_a_minibatch_is_left_out():
         assert len(torch.cat(epoch).unique(dim=0)) == 8
 
 
+@for_each("minibatches", [1, 4, 5, 6, 8])
+def test_an_epoch_of_several_recordings_takes_each_step_once(minibatches):
+    ppo, seen = made(num_envs=3, num_steps=minibatches, epochs=2, minibatch_size=3), []
+    ppo.gradient_step = lambda minibatch: seen.append(minibatch["observation"]) or [torch.tensor(2.5)] * 6
+    metrics = ppo.update(collected(ppo, 3), progress=0.0)
+    for epoch in (seen[:minibatches], seen[minibatches:]):
+        assert len(torch.cat(epoch).unique(dim=0)) == 3 * minibatches
+    torch.testing.assert_close(metrics, torch.full((6,), 2.5))
+
+
 def test_the_norm_is_updated_after_the_gradient_steps():
     """Else probabilities would be compared with those that were computed with another norm."""
     ppo, seen = made(num_envs=2, num_steps=4), []

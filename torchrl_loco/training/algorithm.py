@@ -27,7 +27,7 @@ from torchrl_loco.training.config import TrainingConfig
 from torchrl_loco.training.run_folder import RunFolder
 
 WARMUP = 1  # calls before one is recorded: cuBLAS allocates at its first product, and torch.compile compiles
-RECORDED = 4  # gradient steps at most that are recorded as one: to record one takes as long as to make it directly
+RECORDED = 4  # gradient steps of a recording, at most: to record a step takes as long as to make it
 ROW_ALIGNED = 16  # bytes at a multiple of which each entry of a row of steps begins; rows at one of twice that
 
 
@@ -88,7 +88,7 @@ class Algorithm(ABC):
         """
 
     def minibatches(self, steps: TensorDictBase) -> Iterable[TensorDictBase]:
-        """Returns the minibatches, some of an epoch's, of shuffled ``steps``, a copy, which it may change."""
+        """Returns the minibatches of shuffled ``steps`` of an epoch, a copy, which it may change."""
         return steps.split(self.config.minibatch_size)
 
     def batch_metrics(self, data: TensorDictBase) -> torch.Tensor:
@@ -104,7 +104,7 @@ class Algorithm(ABC):
 
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
-        """Starts what compiles its kernels on CUDA and takes seconds to be ready."""
+        """Starts the compilers of its kernels on CUDA, which take seconds to be ready: torch.compile if it is set."""
         if getattr(config, "compile", False):
             start_compiler()
 
@@ -153,7 +153,7 @@ class Algorithm(ABC):
             steps = frames // config.minibatch_size
             if self._data is None:
                 self._data = Packed(data)
-                # As many steps in each recording of an epoch.
+                # One recording serves the whole epoch, so its length divides that of the epoch.
                 self._order = self._order.new_zeros(math.gcd(steps, RECORDED) * config.minibatch_size)
             else:
                 self._data.steps.update_(data)
@@ -235,7 +235,7 @@ class Algorithm(ABC):
                 group["lr"].fill_(lr)
 
     def _gradient_steps(self) -> None:
-        """Does what is recorded on CUDA: by itself, the gradient steps of ``_order``."""
+        """Makes the gradient steps that CUDA records: by default, those on the steps that ``_order`` numbers."""
         assert self._data is not None
         for minibatch in self.minibatches(self._data[self._order]):
             self._totals += torch.stack([metric.detach() for metric in self.gradient_step(minibatch)])

@@ -75,7 +75,7 @@ class PPO(Algorithm):
 
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
-        """Starts Triton."""
+        """Starts Triton, which computes networks in bfloat16."""
         super().start_compilers(config)
         if config.bf16 and not config.from_pixels:
             start_triton(torch.device(config.device))

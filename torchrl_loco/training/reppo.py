@@ -78,12 +78,12 @@ class REPPO(Algorithm):
 
     @classmethod
     def start_compilers(cls, config: TrainingConfig) -> None:
-        """Starts Triton, and torch.compile where it cannot do all."""
+        """Starts Triton, or torch.compile from pixels and where Triton does not work."""
         if config.from_pixels or not start_triton(torch.device(config.device)):
             super().start_compilers(config)
 
     def fused(self, function: Callable[..., Any], what: str, bf16: bool = False, **options: bool) -> Callable[..., Any]:
-        """Returns a function of tensors as kernels of torch.compile, where there are no others."""
+        """Returns a function of tensors as kernels of torch.compile, or itself if it calls kernels of Triton."""
         return function if isinstance(self._nets, ReppoRows) else super().fused(function, what, bf16, **options)
 
     def acting(self) -> nn.Module:
@@ -304,7 +304,7 @@ class Modules:
         self.sample, self.actor_losses = sample, actor_losses
 
     def take(self, *optimizers: FlatAdam) -> None:
-        """Computes with the parameters themselves, whose values are always those of now."""
+        """Does nothing: modules compute with the parameters themselves."""
 
     def normalised(self, rows: Tensor, norm: ObservationNorm) -> Tensor:
         """Returns normalised rows."""

@@ -205,7 +205,7 @@ def triton_kernels(name: str) -> ModuleType:
 
 @functools.cache
 def triton_works(device: torch.device) -> bool:
-    """Returns whether Triton can compile kernels for a device; of a GPU, a warning says why it cannot.
+    """Returns whether Triton can compile kernels for a device. A warning says why it cannot for a GPU.
 
     Triton comes with torch for Linux, and needs a compiler of C. GPUs before compute capability 8.0, without tensor
     cores for bfloat16, keep torch's kernels.
@@ -224,7 +224,10 @@ def triton_works(device: torch.device) -> bool:
 
 
 def start_triton(device: torch.device) -> bool:
-    """Returns whether Triton works; it hashes itself meanwhile, by which it names what it keeps: half a second."""
+    """Returns whether Triton works, and lets a thread hash Triton's own files if it does.
+
+    Triton names the kernels of its cache by that hash, which takes half a second.
+    """
     works = triton_works(device)
     if works and (key := getattr(importlib.import_module("triton").runtime.cache, "triton_key", None)):
         threading.Thread(target=key, daemon=True).start()

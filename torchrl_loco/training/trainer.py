@@ -141,7 +141,7 @@ class Trainer:
         self.trials = Trials(config, self.frames_per_iteration, self._begin_trial, self._kept_of_trial, self._restore)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
         self._ahead: tuple[TensorDictBase, torch.Tensor] | None = None
-        self._returned = 0.0  # time of the last metrics
+        self._returned = 0.0  # when the last iteration ended
         self.frames, self.iteration, self.seconds = 0, 0, 0.0
         self._non_finite, self._index_errors, self._said = 0, 0, set[str]()
         self._alike: float | None = None  # the reward of the last batch, if there was only one
@@ -229,7 +229,7 @@ class Trainer:
                 "stopping after this update, with a checkpoint; Ctrl-C again stops at once" if first else ""
             ) as interrupted,
         ):
-            self._returned = saved  # not when an earlier call ended
+            self._returned = saved  # a pause since an earlier call is no time of a batch
             stop = is_late = False
             while self.frames < self.last_frame:
                 row = self.iterate(ahead=not (stop or is_late))
@@ -253,7 +253,7 @@ class Trainer:
                         self.episodes.restart()
                 is_late = time.perf_counter() - saved > config.checkpoint_seconds
                 stop, is_late = distributed.any_rank(interrupted() or distributed.is_orphan(), is_late)
-                if self._ahead is not None:  # it is in no checkpoint: the next update is on it
+                if self._ahead is not None:  # no checkpoint holds that batch: the next update is on it
                     continue
                 if stop or is_late:
                     self.save()
@@ -309,7 +309,7 @@ class Trainer:
     def iterate(self, ahead: bool = False) -> dict[str, float]:
         """Returns the metrics of collecting a batch and updating on it; reads from the device once.
 
-        Their seconds are those of this call; of a batch that was collected ahead, those since the call before.
+        The seconds are those of this call, or those since the last one if that collected the batch ahead.
 
         Args:
             ahead: whether the device may go on with the next batch while the host waits for the metrics.
@@ -330,7 +330,8 @@ class Trainer:
         told = {f"metric/{name}": after["metrics", name] for name in self._base.metric_names}
         of_env |= {name: values.nansum() for name, values in told.items()}
         counts = [(~values.isnan()).float().sum() for values in told.values()]
-        lost = [self._base.health()["total", name] for name in ("non_finite", "index_error")]
+        health = self._base.health()["total"]
+        lost = health["non_finite"], health["index_error"]
         numbers = torch.cat([ended, torch.stack([*lost, spread, ends, reward, *counts, *of_env.values()])])
         metrics = algorithm.update(batch, progress=self.trials.progress(self.frames))
         numbers = distributed.mean_of_ranks(torch.cat([numbers, metrics])).to("cpu", non_blocking=True)
@@ -378,9 +379,9 @@ class Trainer:
         return batch, self.episodes.add(after["reward"].squeeze(-1), *flags)
 
     def _collected_ahead(self) -> tuple[TensorDictBase, torch.Tensor] | None:
-        """Returns the next batch, which CUDA collects from where the algorithm's ``began`` says, or after the update.
+        """Returns the next batch, which CUDA collects after the algorithm's ``began``, or without one after the update.
 
-        None is before an evaluation, which begins at the stage of what was learned from, and where a trial ends.
+        ``None`` where an evaluation follows, which begins at the stage of what was learned from, or a trial ends.
         """
         began, frames = self.algorithm.began, self.frames + self.frames_per_iteration
         if frames >= self.last_frame or self._evaluates_after(frames) or self.trials.is_over(frames):

@@ -29,7 +29,7 @@ def _searchsorted(row: torch.Tensor, x: Any, *, out_int32: bool = False, right: 
 def _cross(one: torch.Tensor, other: torch.Tensor, *, dim: int = -1) -> torch.Tensor:
     """Returns the cross product: torch's own decomposition imports sympy, which takes a second."""
     if one.ndim != other.ndim or {one.shape[dim], other.shape[dim]} != {3}:
-        raise ValueError  # torch says why
+        raise ValueError  # then torch's own operator is called, whose error says why
     one, other = torch.broadcast_tensors(one, other)
     return one.roll(-1, dim) * other.roll(1, dim) - one.roll(1, dim) * other.roll(-1, dim)
 
