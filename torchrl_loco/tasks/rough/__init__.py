@@ -336,7 +336,7 @@ class G1Rough(Rough, G1Velocity):
     """A Unitree G1, a humanoid of 29 joints and 33 kg, follows a velocity command over rough ground."""
 
     memory = memory(joints=29, feet=2)
-    presets = {"ppo": {**G1Velocity.presets["ppo"], "norm_eps": 0.1}}
+    presets = {"ppo": {**G1Velocity.presets["ppo"], "epochs": 4, "norm_eps": 0.1}}
 
 
 class H1Rough(Rough, H1Velocity):

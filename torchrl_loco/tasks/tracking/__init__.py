@@ -117,9 +117,7 @@ class Tracking(Robot):
         **{"counted": ((2, PIECES), torch.int64), "recent": (2, PIECES), "chance": PIECES},
     }
     summed_over_ranks = ("visits", "failures")
-    presets = {
-        "ppo": {**G1Velocity.presets["ppo"], "total_frames": 300_000_000, "entropy_coeff": 0.005, "eval_episodes": 256}
-    }
+    presets = {"ppo": {**G1Velocity.presets["ppo"], "total_frames": 300_000_000, "epochs": 4, "eval_episodes": 256}}
     noise = NOISE
     longest_delay = 1
     command_ranges = {"phase": {"phase": (0.0, 1.0)}}  # and the clip, where there are several

@@ -441,6 +441,7 @@ class G1Velocity(Velocity):
         "ppo": {
             **Velocity.presets["ppo"],
             "total_frames": 420_000_000,
+            "epochs": 3,
             "minibatch_size": 32_768,
             "entropy_coeff": 0.005,
         },
