@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 PICTURES = ROOT / "docs" / "_static"
 
-SPEED = "2026-11-28/tables"
+SPEED = "2026-11-30/tables"
 """Folder of ``python -m benchmarks tables``, from which all speeds are."""
 SUITE = "2026-11-24/cpu/suite.json"
 VARIATION = "2026-11-25/h100-third/variation.json"
@@ -332,7 +332,7 @@ def sources(files: Iterable[Iterable[str]]) -> str:
 def draw_steps(picture: Path) -> None:
     """Draws the times of a control step of 8192 worlds as bars, a panel for each of four bodies."""
     figure = Figure(figsize=(9, 6.2), layout="constrained")
-    bodies = ("walker", "cheetah", "Go1", "G1")
+    bodies = ("walker", "humanoid", "Go1", "G1")
     for body, axes in zip(bodies, figure.subplots(2, 2, sharex=True, sharey="row").flat, strict=True):
         rows = {line: measured().get((TASKS_OF[body], line.case, 8192)) for line in reversed(STEPS)}
         shown = {line: row["ms"] for line, row in rows.items() if row and line.case not in OF_RUNNERS}
