@@ -55,7 +55,7 @@ class SimConfig:
             ``euler_damping`` do. For tasks of yours a line of the log and ``repr(env)`` say so, where the model names
             another than MuJoCo's default; :meth:`of` keeps those of the model.
         contacts: what bodies touch: ``all`` that the model says, or the ``ground``, that is, what is fixed to the
-            world and not each other. Under both engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
+            world and not each other. Under all engines, and in :attr:`torchrl_loco.LocoEnv.mj_model`.
         solids_on_terrain: what boxes, cylinders, ellipsoids and meshes do on height fields: ``exact`` is what MuJoCo
             finds, which the engine ``compiled`` does not have, as it jumps with rounding; ``spheres`` gives the model
             of an environment spheres in their corners, of up to 0.02 m, which in their place touch height fields and,

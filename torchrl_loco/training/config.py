@@ -354,7 +354,7 @@ class REPPOConfig(TrainingConfig):
 
     compile: bool = True
     """Whether torch.compile makes kernels of losses and acting policy on CUDA where there are no others, that is from
-    pixels and where Triton does not work. The first start on a machine takes 20 s longer then."""
+    pixels and where Triton does not work. The first start on a machine takes 20 to 40 s longer then."""
     kl_bound: float = 0.1
     """Bound of the KL divergence from the policy that collected the batch, in one state (nats)."""
     init_kl_weight: float = 0.01
