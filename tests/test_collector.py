@@ -1,5 +1,6 @@
 """Our collection loop against TorchRL's Collector."""
 
+import contextlib
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -25,7 +26,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 import torchrl_loco
-from torchrl_loco import RolloutCollector
+from torchrl_loco import RolloutCollector, collector
 from torchrl_loco.collector import stack, stacks_slowly, what_forbids_recording
 from torchrl_loco.tasks.walker import WalkerRun
 
@@ -220,12 +221,38 @@ def test_why_batches_are_not_recorded(make):
     assert "CUDA" in RolloutCollector(made, chosen, frames_per_batch=8).step_by_step
     summed = torchrl_loco.TransformedEnv(made, RewardSum())
     checked = torchrl_loco.TransformedEnv(made, Compose(RewardSum(), FiniteTensorDictCheck()))
-    cuda, slow = (SimpleNamespace(device=torch.device("cuda"), engine=name) for name in ("compiled", "mujoco_warp"))
+    of_env = {"device": torch.device("cuda"), "engine": "compiled", "compile_hooks": True}
+    changes = ({}, {"engine": "mujoco_warp"}, {"compile_hooks": False})
+    cuda, slow, printing = (SimpleNamespace(**of_env | change) for change in changes)
     assert what_forbids_recording(made, cuda, chosen) is what_forbids_recording(summed, cuda, chosen) is None
     assert "'mujoco_warp'" in what_forbids_recording(made, slow, chosen)
+    assert "hooks at every step" in what_forbids_recording(made, printing, chosen)
     assert "no nn.Module" in what_forbids_recording(made, cuda, lambda td: td)
     for env in (checked, torchrl_loco.TransformedEnv(checked, RewardSum())):
         assert "FiniteTensorDictCheck may keep" in what_forbids_recording(env, cuda, chosen)
+
+
+class Remembering(torch.nn.Module):
+    """Counts its steps in the TensorDict."""
+
+    def forward(self, td):
+        steps = td.get("steps", torch.zeros(*td.batch_size, 1)) + 1
+        return td.update({"steps": steps, "action": torch.zeros(*td.batch_size, 6)})
+
+
+@for_each("recorded", [False, True])
+def test_worlds_that_begin_anew_forget_what_a_policy_keeps(make, recorded, monkeypatch):
+    """With a stand-in for CUDA's graphs, which computes again what they replay."""
+    if recorded:
+        monkeypatch.setattr(collector, "what_forbids_recording", lambda *_: None)
+        monkeypatch.setattr(collector, "noted_synchronisation", lambda: contextlib.nullcontext([]))
+        monkeypatch.setattr(collector, "TorchGraph", lambda work, *_, **__: work)
+    made = RolloutCollector(make("walker_stand", False, stagger=False), Remembering(), frames_per_batch=4 * 5)
+    for _ in range(4):
+        made.rollout()
+    assert made.replays == recorded
+    made.load_state_dict({})
+    assert made.rollout()["steps"][0, :, 0].tolist() == [1, 2, 3, 4, 5]
 
 
 def on_cuda(task, wrap=False, num_envs=64, **settings):

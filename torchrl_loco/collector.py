@@ -170,7 +170,7 @@ class RolloutCollector:
     def _recorded_steps(self) -> list[TensorDictBase]:
         assert self._recording is not None
         if self._carried is not self._recording.carried:
-            self._recording.carried.update_(self._carried)
+            self._recording.carried.zero_().update_(self._carried)  # a policy's memory begins at zero then
         try:
             steps = self._recording.replay()
         except RuntimeError as error:
@@ -335,6 +335,8 @@ def what_forbids_recording(env: EnvBase, base: LocoEnv, policy: Any) -> str | No
         return "only CUDA has graphs of torch's work"
     if base.engine != "compiled":
         return f"engine {base.engine!r} launches too many kernels to gain from it"
+    if not base.compile_hooks:
+        return "compile_hooks=False runs hooks at every step"
     if not isinstance(policy, nn.Module):
         return "the policy is no nn.Module, so it would not be noticed if its weights were replaced"
     for transform in (part for each in unwrap(env)[1] for part in each.modules()):

@@ -8,6 +8,7 @@ from small_runs import EPISODE, SMALL
 from torchrl.data import Bounded, Unbounded
 from torchrl.envs import (
     Compose,
+    DTypeCastTransform,
     FrameSkipTransform,
     RewardSum,
     StepCounter,
@@ -63,6 +64,9 @@ def test_what_cannot_be_trained_on():
     images = TransformedEnv(env, UnsqueezeTransform(-1, in_keys=["observation"]))
     with pytest.raises(ValueError, match=r"'observation' must be a row of numbers.*\(24, 1\).*FlattenObservation"):
         Spaces.of(images)
+    double = TransformedEnv(env, DTypeCastTransform(torch.float32, torch.float64, in_keys=["observation"]))
+    with pytest.raises(ValueError, match=r"'observation' must be torch.float32 to train on, but is torch.float64"):
+        Spaces.of(double)
     env.action_spec = Bounded(-2.0, 2.0, (3, 6))
     with pytest.raises(ValueError, match=r"bounded by \[-1, 1\], or by nothing"):
         Spaces.of(env)

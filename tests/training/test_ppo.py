@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import itertools
 import math
 
 import pytest
@@ -385,6 +386,38 @@ def test_what_is_frozen_stays():
         assert (by == 0.0) == (".0.weight" in name or ".0.bias" in name), name
 
 
+@for_each("frozen", [6, 1])
+def test_a_frozen_actor_or_critic_stays(frozen):
+    """As a critic that learns first, beside an actor that was trained before."""
+
+    def network(inputs, outputs):
+        return nn.Sequential(nn.Linear(inputs, 12), nn.Tanh(), nn.Linear(12, outputs)).requires_grad_(outputs != frozen)
+
+    ppo = PPO(preset("walker_stand", "cpu", "ppo", total_frames=10_000, **EIGHT), WALKER, network)
+    stays = {6: "actor.module.0.module.1.", 1: "critic."}[frozen]
+    moved = one_update(ppo)
+    assert any(name.startswith(stays) for name in moved)
+    for name, by in moved.items():
+        assert (by == 0.0) == name.startswith(stays), name
+
+
+def test_what_actor_and_critic_share_learns_of_both():
+    trunk = nn.Linear(24, 12)
+
+    def network(inputs, outputs):
+        return nn.Sequential(trunk, nn.Tanh(), nn.Linear(12, outputs))
+
+    ppo = PPO(preset("walker_stand", "cpu", "ppo", total_frames=10_000, lr=0.01, **EIGHT), WALKER, network)
+    sums = []
+    for _ in range(4):
+        ppo.optimizer.zero_grad()
+        ppo.optimizer.wide(torch.float32)[trunk.weight].sum().backward()
+        ppo.optimizer.clipped_step(1.0)
+        sums.append(trunk.weight.sum().item())
+    assert all(after < before for before, after in itertools.pairwise(sums))
+    assert all(by > 0.0 for by in one_update(ppo).values())
+
+
 def test_activations_may_write_in_place():
     def network(inputs, outputs):
         return nn.Sequential(nn.Linear(inputs, 12), nn.ELU(inplace=True), nn.Linear(12, outputs))
@@ -423,6 +456,19 @@ def test_a_critic_may_be_any_module():
     value = ppo._value(rows, ppo.optimizer.wide(torch.float32))
     torch.testing.assert_close(value, ppo.critic.module(seen))
     assert all(by > 0.0 for by in one_update(ppo).values())
+
+
+def test_a_critic_sees_rows_one_after_the_other():
+    """Whose layers may look at the dimensions; advantages and gradient steps are of the same values."""
+
+    def network(inputs, outputs):
+        if outputs == 6:
+            return nn.Linear(inputs, outputs)
+        return nn.Sequential(nn.Linear(inputs, 9), nn.Softmax(dim=1), nn.Linear(9, 1))
+
+    ppo = PPO(preset("walker_stand", "cpu", "ppo", total_frames=10_000, **EIGHT), WALKER, network)
+    seen, weights = torch.randn(8, 5, 24), ppo.optimizer.wide(torch.float32)
+    torch.testing.assert_close(ppo._values(seen, weights).view(-1, 1), ppo._value(seen.view(-1, 24), weights))
 
 
 def test_what_is_not_a_number_is_seen():

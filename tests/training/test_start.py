@@ -1,10 +1,13 @@
 """``train``: what it takes, what it returns, and how what was handed in as an object is continued."""
 
+import dataclasses
+import gc
 import json
 import multiprocessing
 import re
 import shutil
 import sys
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -21,6 +24,7 @@ from torchrl_loco import Vary, cli, known_files, registry
 from torchrl_loco.policy import Policy
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
+from torchrl_loco.training.config import PPOConfig
 from torchrl_loco.training.environments import content_of
 from torchrl_loco.training.start import _warn_of_what_is_not_kept
 from torchrl_loco.training.watching import last_policy
@@ -511,6 +515,56 @@ def test_what_cannot_teach_anything_is_said(tmp_path, capsys):
         train(tasks[name], algorithm="ppo", device="cpu", out=tmp_path, **{**SMALL, "action_repeat": 1})
         said = capsys.readouterr()
         assert (said.out + said.err).count(note) == 1
+
+
+def test_networks_that_are_not_finite_replace_nothing(tmp_path, monkeypatch):
+    """Neither the last checkpoint nor the best policy."""
+    update = PPO.update
+
+    def diverging(ppo, batch, progress):
+        metrics = update(ppo, batch, progress)
+        if progress > 0.4:
+            ppo.critic.module[1][0].bias.data.fill_(torch.nan)
+        return metrics
+
+    monkeypatch.setattr(PPO, "update", diverging)
+    settings = {**QUICK, "total_frames": 512, "eval_interval": 128, "checkpoint_seconds": 0.0}
+    with pytest.raises(ValueError, match=r"networks of .* are not finite after 384 frames: a smaller lr may help"):
+        train("walker_stand", algorithm="ppo", device="cpu", out=tmp_path, **settings)
+    (run,) = map(RunFolder, tmp_path.iterdir())
+    assert run.load_checkpoint("cpu")["frames"] == 256
+    assert [row["frames"] for row in run.read_evaluations()] == [128, 256]
+
+
+def test_settings_of_an_algorithm_of_ones_own_may_be_defined_again(tmp_path):
+    """In a cell of a notebook that runs twice; those of the package keep their names."""
+
+    def mine(beta, name="mine"):
+        fields = [("beta", float, beta)]
+        settings = dataclasses.make_dataclass("MineConfig", fields, bases=(PPOConfig,), frozen=True)
+        settings.algorithm = name
+        return type("Mine", (PPO,), {"config_type": settings})
+
+    for beta in (0.1, 0.7):
+        run = train("walker_stand", algorithm=mine(beta), device="cpu", out=tmp_path, **QUICK)
+        assert run.load_config().beta == beta
+    with pytest.raises(ValueError, match=r"MineConfig.algorithm is 'ppo', which is PPOConfig's: give it a name"):
+        train("walker_stand", algorithm=mine(0.1, "ppo"), device="cpu", out=tmp_path, **QUICK)
+
+
+def test_earlier_trainings_of_a_process_leave_no_memory_behind(tmp_path, monkeypatch):
+    config = preset("walker_stand", "cpu", "ppo", out=tmp_path, **QUICK)
+    monkeypatch.setattr(gc, "isenabled", lambda: False)
+    gc.disable()
+    try:
+        trainer = begin(config)
+        trainer.train()
+        known = [weakref.ref(each) for each in (trainer.algorithm, trainer.collector, trainer.env)]
+        del trainer
+        begin(config)
+        assert [each() for each in known] == [None] * 3
+    finally:
+        gc.enable()
 
 
 def test_a_script_that_is_read_for_its_class_does_not_train_again(tmp_path, monkeypatch):

@@ -13,14 +13,16 @@ import torch
 from compare import assert_same
 from for_each import for_each
 from small_runs import EPISODE, SMALL, WALKER, made, networks, small_walker, trained
+from torchrl.envs import VecNormV2
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import torchrl_loco
 from torchrl_loco import NonFiniteWarning, RolloutCollector, nan_dump
 from torchrl_loco.cli.errors import user_errors
+from torchrl_loco.envs.transforms import state_of_transforms
 from torchrl_loco.policy import Policy
 from torchrl_loco.tasks.walker import Walker
-from torchrl_loco.training import Given, RunFolder, Trainer, evaluate_run, preset, train, trainer
+from torchrl_loco.training import Given, RunFolder, Trainer, begin, evaluate_run, preset, train, trainer
 from torchrl_loco.training.algorithm import Algorithm, settings_for_small_networks
 from torchrl_loco.training.evaluation import Evaluator
 from torchrl_loco.training.process import interruptible
@@ -440,3 +442,29 @@ def test_metrics_are_logged_and_a_curriculum_is_judged_where_it_is(tmp_path):
         assert evaluations[1]["metric/steps"] == pytest.approx(steps + (EPISODE - 1) / 2)
         longer = train(Levels, resume=run, total_frames=512)
         assert longer.read_metrics()["metric/steps"][2] == 81.0
+
+
+@pytest.mark.filterwarnings("ignore:Support of VecNormV2 for containers:UserWarning")  # for any batch
+def test_a_policy_is_compared_behind_the_transforms_of_its_time(tmp_path, monkeypatch):
+    """Where a curriculum has gone on, and transforms have learned more since its evaluation."""
+    played, summary = [], Trainer._summary
+
+    def watched(self, policy, final):
+        played.append((policy.info["frames"], state_of_transforms(self.env)))
+        return summary(self, policy, final)
+
+    monkeypatch.setattr(Trainer, "_summary", watched)
+    with small_walker():
+        base = Levels(4, "cpu", seed=0)
+        env = torchrl_loco.TransformedEnv(base, VecNormV2(["observation"], reduce_batch_dims=True))
+        settings = {name: value for name, value in SMALL.items() if name not in ("num_envs", "action_repeat")}
+        config = preset(Levels, "cpu", "ppo", out=tmp_path, num_envs=4, protocol=base.protocol, **settings)
+        run = begin(config, Given(env=env))
+        for _ in range(2):
+            run.iterate()
+            run.evaluate()
+        (first, learned), (again, behind), (last, more) = played
+        assert first == again < last
+        assert_same(behind, learned)
+        assert_same(state_of_transforms(env), more)
+        assert str(more) != str(learned)

@@ -12,7 +12,7 @@ from torchrl_loco import Go1Velocity, cli
 from torchrl_loco.cli import policies
 from torchrl_loco.collector import rewritten_by
 from torchrl_loco.policy import Policy
-from torchrl_loco.training import Trainer, preset, train
+from torchrl_loco.training import Given, Trainer, begin, preset, train
 from torchrl_loco.training.environments import Environments, make_for
 
 
@@ -54,6 +54,19 @@ def test_layers_of_another_kind_are_refused(tmp_path):
                 Trainer(made(tmp_path / init.stem, init=str(init)))
         with pytest.raises(ValueError, match=r"run with network of your own, which it does not hold: name .*policy"):
             policies.Which().load(str(own.checkpoint), "cpu")
+
+
+@for_each("kept", [{"elementwise_affine": False}, {"bias": False}])
+def test_norms_without_weights_are_what_a_file_has_for_them(kept, tmp_path):
+    def network(inputs, outputs):
+        return nn.Sequential(nn.Linear(inputs, 8), nn.LayerNorm(8, **kept), nn.Linear(8, outputs))
+
+    with small_walker():
+        own = train("walker_stand", device="cpu", algorithm="ppo", network=network, out=tmp_path, **SMALL)
+        begun = begin(own.load_config(init=own.policy, out=tmp_path / "next"), Given(network=network)).algorithm
+        seen = torch.randn(5, 24)
+        with torch.no_grad():
+            torch.testing.assert_close(begun.actor[0].module(seen)[0].tanh(), own.load_policy("cpu")(observation=seen))
 
 
 def test_settings_of_the_simulation_are_those_of_the_run(tmp_path):

@@ -77,7 +77,7 @@ class World:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
-        self._title, self._variation = type(task).__name__, task.variation
+        self._title, self._variation, self._as_they_are = type(task).__name__, task.variation, not task.compile_hooks
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device. The caller's autocast is for the caller's own networks.
         with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
@@ -270,7 +270,7 @@ class World:
             each.record(sim)
         self.kinds = {hook: part.kind for hook, part in of_hook.items()}
         for each, names in parts.items():
-            if each.kind != "plain torch" or sim.device.is_cuda:  # where the step is recorded as a graph
+            if each.kind != "plain torch" or (sim.device.is_cuda and task.compile_hooks):  # the step is a graph then
                 self.fixed |= names
         if self._scans.arrays:
             self._scan_first(hooks.catalog.scanning)
@@ -350,7 +350,7 @@ class World:
             assert world is not None
             getattr(world, name)()
 
-        if not several or not self.sim.device.is_cuda:
+        if not several or not self.sim.device.is_cuda or self._as_they_are:
             return work
         graph, recorded = TorchGraph(work, self.sim.qpos.device, warmup=1), True
 

@@ -89,7 +89,12 @@ class Spaces:
         for key in ("observation", "privileged"):
             if key not in spec.keys():  # noqa: SIM118
                 continue
-            shape = spec[key].shape[len(env.batch_size) :]
+            shape, dtype = spec[key].shape[len(env.batch_size) :], spec[key].dtype
+            if dtype != torch.float32:
+                raise ValueError(
+                    f"{key!r} must be torch.float32 to train on, but is {dtype}: leave transforms out that change it, "
+                    "or cast it back with torchrl.envs.DTypeCastTransform"
+                )
             if len(shape) != 1:
                 raise ValueError(
                     f"{key!r} must be a row of numbers for each world to train on, but has shape {tuple(shape)}: "

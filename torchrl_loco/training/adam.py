@@ -205,7 +205,7 @@ class Vectors:
     def gradient(self) -> Tensor:
         """Returns the gradient, zero where there is none: that of the vector, and the parameters' own beside it."""
         given = [] if self.whole.grad is None else [self.whole.grad]
-        if self._in_parts is not None and self._has_parts:
+        if self._has_parts:
             given.append(torch.empty_like(self.whole))
             launch(sum_of_parts, len(self.whole), [self._in_parts], given[-1:], LARGE)
         gradient = functools.reduce(torch.add, given) if given else torch.zeros_like(self.whole)

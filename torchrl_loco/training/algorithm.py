@@ -157,6 +157,7 @@ class Algorithm(ABC):
                 self._order = self._order.new_zeros(math.gcd(steps, RECORDED) * config.minibatch_size)
             else:
                 self._data.steps.update_(data)
+            del data  # of which that is a copy
         self._totals.zero_()
         self.join()
         for order in orders:
@@ -434,6 +435,8 @@ def _copy(own: nn.Module, other: nn.Module, source: Path, *, last: bool) -> None
         _check_strides(source, other.strides, own.strides)
     mine, theirs = own.state_dict(), other.state_dict()
     for name, values in theirs.items():
+        if name not in mine and isinstance(own, nn.LayerNorm) and (values == float(name == "weight")).all():
+            continue  # which a file has for a norm without
         fits = name in mine and mine[name].shape[1:] == values.shape[1:]
         rows = len(values) if values.ndim else 1
         if not fits or (values.ndim and len(mine[name]) not in (rows, 2 * rows * last)):

@@ -490,6 +490,20 @@ def check_packages_of(config: TrainingConfig) -> None:
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig, SVGConfig)}
 
 
+def register(kind: type[TrainingConfig]) -> None:
+    """Lets settings of an algorithm of a user be read by its name; in a notebook a cell may define them again.
+
+    Raises:
+        ValueError: the name is that of an algorithm of the package, which has other settings.
+    """
+    known = CONFIGS.get(kind.algorithm, kind)
+    if known is not kind and known.__module__ == TrainingConfig.__module__:
+        raise ValueError(
+            f"{kind.__name__}.algorithm is {kind.algorithm!r}, which is {known.__name__}'s: give it a name of its own"
+        )
+    CONFIGS[kind.algorithm] = kind
+
+
 def config_from_json(values: dict[str, Any]) -> TrainingConfig:
     """Returns the settings that :meth:`TrainingConfig.to_json` has turned into ``values``."""
     algorithm = check_choice("algorithm", values.get("algorithm"), CONFIGS)

@@ -175,6 +175,12 @@ class Environments:
             env = TransformedEnv(env, copy.deepcopy(transform.clone()))  # that it learns in evaluations stays apart
         return env
 
+    def close(self) -> None:
+        """Closes the worlds of evaluations."""
+        for env in self._evaluating.values():
+            env.close()
+        self._evaluating.clear()
+
     def shown(self, episodes: int, seed: int, info: Mapping[str, Any]) -> Any:
         """Returns worlds whose first is filmed: of a task that plays cases, such as motions, one that plays the first.
 

@@ -68,8 +68,9 @@ class PPO(Algorithm):
             Rows(net, part if isinstance(part, PixelEncoder) else spaces.rows[key], self._dtype)
             for net, part, key in ((mean, first, spaces.actor_key), (value, of_critic, spaces.critic_key))
         )
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = self.make_optimizer("actor and critic", parameters)
+        if {*mean.parameters()} & {*value.parameters()}:  # kernels would write both networks' slopes to one place
+            self._mean.in_triton = self._value.in_triton = False
+        self.optimizer = self.make_optimizer("actor and critic", self.networks.parameters())  # each once
         self._compile()
         self._written = ("action", "action_log_prob", *("before_tanh",) * spaces.bounded)
 
@@ -160,7 +161,8 @@ class PPO(Algorithm):
         outputs = self._mean(self.observed(minibatch), weights, parts), self._std(), value
         self.join()
         *slopes, metrics = clipped_loss(*outputs, minibatch, config, self.spaces.bounded)
-        torch.autograd.backward(outputs, slopes)
+        learning = [pair for pair in zip(outputs, slopes, strict=True) if pair[0].requires_grad]
+        torch.autograd.backward([output for output, _ in learning], [slope for _, slope in learning])
         self.join()  # autograd waits only for gradients that it adds up itself
         if config.target_kl:
             self._follow(metrics[self.metric_names.index("kl_approx")])

@@ -68,15 +68,23 @@ class Rows:
     ) -> Tensor:
         """Returns what it gives, ``(..., outputs)``, with ``weights`` for its own, whose rows may be longer as well.
 
+        The network itself sees rows one after the other, whatever dimensions they have here: a layer may look at these.
         Kernels of Triton write slopes by the weights into so many ``parts`` of the gradient as they ask for; without
         parts they compute only where there are no gradients.
         """
+        of_row = 3 if self._encoder else 1
+        flat = rows.reshape(-1, *rows.shape[-of_row:])
+        return self._computed(flat, weights, parts).view(*rows.shape[:-of_row], -1)
+
+    def _computed(
+        self, rows: Tensor, weights: Mapping[nn.Parameter, Tensor], parts: Callable[[int], Tensor] | None
+    ) -> Tensor:
         learns = torch.is_grad_enabled() if parts is None else not all(part.requires_grad for part in self._parameters)
         if self.in_triton and not learns:
-            mlp, flat = triton_kernels("mlp"), rows.reshape(-1, rows.shape[-1])
-            if len(flat) * max(flat.stride(0), *map(len, self._parameters)) < mlp.MOST:
+            mlp = triton_kernels("mlp")
+            if len(rows) * max(rows.stride(0), *map(len, self._parameters)) < mlp.MOST:
                 into = None if parts is None else parts(mlp.PARTS)
-                return mlp.SiluNetwork.apply(flat, into, *self.own(weights)).view(*rows.shape[:-1], -1)
+                return mlp.SiluNetwork.apply(rows, into, *self.own(weights))
         if self._encoder:
             own = {name: weights[part][..., : part.shape[-1]] for name, part in self._encoder.named_parameters()}
             rows = functional_call(self._encoder, own, (rows,)).to(next(iter(own.values())).dtype)
@@ -94,9 +102,7 @@ class Rows:
                 for whole in (weights[part],)
             }
             if index in self._normed:
-                flat, shape = rows.reshape(-1, rows.shape[-1]), rows.shape
-                rows = triton_kernels("normed").NormedSilu.apply(flat, left, *own.values(), layer.eps).view(shape)
-                left = None
+                rows, left = triton_kernels("normed").NormedSilu.apply(rows, left, *own.values(), layer.eps), None
             elif isinstance(layer, nn.Linear):
                 left = own.pop("bias", None) if index + 1 in self._normed else None
                 rows, outputs = Affine.apply(rows, own["weight"], own.get("bias")), len(own["weight"])
@@ -114,7 +120,7 @@ class Affine(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        """Returns what the layer gives, shape ``(..., outputs)``."""
+        """Returns what the layer gives of rows ``(n, inputs)``, shape ``(n, outputs)``."""
         ctx.outputs, more = len(weight), aligned(len(weight)) - len(weight) if rows.is_cuda else 0
         if more:
             weight, bias = pad(weight, (0, 0, 0, more)), None if bias is None else pad(bias, (0, more))
@@ -125,9 +131,8 @@ class Affine(torch.autograd.Function):
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
         """Returns the slopes by rows, weight and bias."""
         (rows, weight), (by_rows, by_weight, by_bias) = ctx.saved_tensors, ctx.needs_input_grad
-        flat, n = slope.reshape(-1, slope.shape[-1]), slope.shape[:-1].numel()
-        of_weight = (flat.mT @ rows.reshape(n, -1))[: ctx.outputs] if by_weight else None
-        of_bias = (flat.new_ones(1, n) @ flat)[0, : ctx.outputs] if by_bias else None
+        of_weight = (slope.mT @ rows)[: ctx.outputs] if by_weight else None
+        of_bias = (slope.new_ones(1, len(slope)) @ slope)[0, : ctx.outputs] if by_bias else None
         return slope @ weight if by_rows else None, of_weight, of_bias
 
 

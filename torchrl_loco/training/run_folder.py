@@ -166,7 +166,8 @@ class RunFolder:
         try:
             config = config_from_json(json.loads(path.read_text()))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
-            why = "is damaged, from another release, or of a task that is not installed"
+            why = "is damaged, from another release, of a task that is not installed, or of an algorithm of yours that "
+            why += "training.train was not given in this process"
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
 

@@ -18,13 +18,13 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import (
-    CONFIGS,
     OF_PIXELS,
     Sim,
     TrainingConfig,
     check_setting,
     checked_sim,
     preset,
+    register,
     tuning_note,
 )
 from torchrl_loco.training.environments import Given, unwrapped
@@ -83,8 +83,7 @@ def train(
     )
     cls: Any = task if given.env is None else type(unwrapped(given.env)[0])
     if given.algorithm is not None:
-        kind = given.algorithm.config_type
-        CONFIGS.setdefault(kind.algorithm, kind)  # by which the settings of the run are read again
+        register(given.algorithm.config_type)  # by which the settings of the run are read again
     chosen = {name: value for name, value in (("out", out), ("device", device)) if value is not None}
     if resume is not None:
         changes = settings | chosen
@@ -223,6 +222,7 @@ def train_to_end(trainer: Trainer, given: Given, errors: Callable[..., Any] = as
     finally:
         if given.env is None:
             trainer.env.close()
+        trainer.environments.close()
 
 
 def begin(config: TrainingConfig, given: "Given | None" = None) -> Trainer:

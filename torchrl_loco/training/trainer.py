@@ -4,11 +4,13 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import gc
 import json
 import logging
 import math
 import sys
 import time
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -42,11 +44,12 @@ from torchrl_loco.training.trials import Trials
 
 COPIES_IN_BATCH = 8
 """How often the pixels of a batch lie in memory: before and after a step, collected, stacked, packed and shuffled."""
+_ALIVE: "weakref.WeakSet[Trainer]" = weakref.WeakSet()
 ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls in (PPO, REPPO, SVG)}
 
 
 class NothingToLearnError(ValueError):
-    """No step of a batch was finite."""
+    """No step of a batch was finite, or networks are not any more."""
 
 
 class Trainer:
@@ -86,6 +89,9 @@ class Trainer:
         device: str | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
+        if _ALIVE:  # they lie in cycles: batches, graphs and worlds of earlier trainings would stay beside its own
+            gc.collect()
+        _ALIVE.add(self)
         self.run = run
         changes = {"total_frames": total_frames, "device": device, "options": options}
         with contextlib.ExitStack() as undone:
@@ -241,14 +247,14 @@ class Trainer:
                 bar.update(self.frames_per_iteration)
                 if first:
                     self._say_once(row)
-                trial_is_over = self.trials.is_over(self.frames)
-                if trial_is_over or self.frames >= self.last_frame or self._evaluates_after(self.frames):
+                if self._evaluates_after(self.frames):
+                    self._check_networks()
                     mean = None
                     if loggers is not None:
                         mean = self.evaluate()["mean"]
                         loggers.log({"evaluation": mean}, self.frames)
                     distributed.wait_for_all()
-                    if trial_is_over:
+                    if self.trials.is_over(self.frames):
                         self.trials.end(self.frames, distributed.from_first(mean))
                         self.episodes.restart()
                 is_late = time.perf_counter() - saved > config.checkpoint_seconds
@@ -256,6 +262,7 @@ class Trainer:
                 if self._ahead is not None:  # no checkpoint holds that batch: the next update is on it
                     continue
                 if stop or is_late:
+                    self._check_networks()
                     self.save()
                     saved, is_late = time.perf_counter(), False
                 if stop:
@@ -264,9 +271,19 @@ class Trainer:
                     raise KeyboardInterrupt
 
     def _evaluates_after(self, frames: int) -> bool:
-        """Returns whether an evaluation is due after so many frames, beside those at an end."""
+        """Returns whether an evaluation is due after so many frames: at the end of each policy, and in between."""
         interval = self.config.eval_interval
-        return bool(interval) and self.trials.own_frames(frames) % interval < self.frames_per_iteration
+        between = bool(interval) and self.trials.own_frames(frames) % interval < self.frames_per_iteration
+        return between or frames >= self.last_frame or self.trials.is_over(frames)
+
+    def _check_networks(self) -> None:
+        """Raises an error before networks that are not finite are evaluated, or take the place of a checkpoint."""
+        if all(bool(part.isfinite().all()) for part in self.algorithm.networks.parameters()):
+            return
+        raise NothingToLearnError(
+            f"the networks of {self.run.path} are not finite after {self.frames} frames: a smaller lr may help, or "
+            "a look at the last rows of metrics.csv; an earlier checkpoint and policy stay"
+        )
 
     def _say_once(self, row: dict[str, float]) -> None:
         """Prints what a user should know after a batch with these metrics, each thing once in a run."""
@@ -351,6 +368,7 @@ class Trainer:
             row[name] = row[name] / count if count else math.nan
         before, self._non_finite = self._non_finite, round(non_finite * distributed.ranks())
         if ends == 1.0 and self._non_finite - before >= config.frames_per_batch * distributed.ranks():
+            self._check_networks()
             raise NothingToLearnError(
                 f"there is nothing to learn from: in all steps of a batch of {self.run.path} a state, observation or "
                 "reward was not finite. torchrl-loco inspect shows the first, which its nan_dump.safetensors holds"
@@ -383,8 +401,8 @@ class Trainer:
 
         ``None`` where an evaluation follows, which begins at the stage of what was learned from, or a trial ends.
         """
-        began, frames = self.algorithm.began, self.frames + self.frames_per_iteration
-        if frames >= self.last_frame or self._evaluates_after(frames) or self.trials.is_over(frames):
+        began = self.algorithm.began
+        if self._evaluates_after(self.frames + self.frames_per_iteration):
             return None
         if not self.collector.replays or distributed.ranks() > 1:
             return None
@@ -428,8 +446,10 @@ class Trainer:
             return
         best = Policy.load(self.run.policy, self.config.device)
         if best.info.get("stage") != json.loads(json.dumps(stage)):
-            best.info["stage"] = stage
+            best.info["stage"], now = stage, state_of_transforms(self.env)
+            load_transforms(self.env, self._transforms_of_best)
             self._best = best.info["selected_by"] = self._summary(best, final=False)["mean"]
+            load_transforms(self.env, now)
             best.save(self.run.policy)
 
     def _summary(self, policy: Policy, final: bool) -> dict[str, float]:
@@ -558,9 +578,11 @@ class Trainer:
         if distributed.is_first():
             if self.run.policy.is_file() and not was_edited:
                 try:
-                    self._best = Policy.load(self.run.policy, "cpu").info.get("selected_by", -math.inf)
+                    info = Policy.load(self.run.policy, "cpu").info
                 except ValueError as error:
                     raise ValueError(f"{error}. Move it away: the run goes on without") from error
+                if not self.environments.transforms or info.get("frames", 0) <= self.frames:  # else theirs are lost
+                    self._best = info.get("selected_by", -math.inf)
             self._transforms_of_best = checkpoint.get("transforms_of_best", {})
         if not same_kind and distributed.is_first():
             logging.getLogger("torchrl_loco").warning(
