@@ -236,6 +236,27 @@ def test_both_engines_begin_at_the_stage_of_the_policy_and_have_its_simulation(t
     assert "3 episodes of 2 s" in report.lines[0]
 
 
+class Kept(Late):
+    """Asks for nothing but a share of what the policy had in its training."""
+
+    holds = {}
+
+    def terminated(self, s):
+        return s.steps < 0
+
+
+def test_a_policy_that_had_more_when_its_training_ended_does_not_hold(tmp_path):
+    """Also in conditions in which the simulator of the training has as little; not in shorter episodes."""
+    path = tmp_path / "kept.onnx"
+    export_policy(constant(torchrl_loco.registry.task_name(Kept), 1, 6, 1.0, mean=80.0), path)
+    for conditions, words in {
+        Conditions(episodes=2): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0 when its",
+        Conditions(episodes=2, delay=(2, 2)): "DOES NOT HOLD: return 38.0, at least 72.0 is asked for, 90% of 80.0",
+        Conditions(episodes=2, seconds=0.5): "holds: return 20.0, at least 18.0 is asked for, 90% of 20.0 in the",
+    }.items():
+        assert verify(path, conditions, "cpu").lines[-1].startswith(words)
+
+
 def test_noise_is_the_tasks_own(tmp_path):
     played = []
     policy = Exported(exported(tmp_path / "late.onnx"))

@@ -33,7 +33,7 @@ class Conditions:
     max_falls: float | None = within(FRACTION, None)
     """Greatest share of episodes that terminate."""
     min_return: float | None = within(NOT_NEGATIVE, None)
-    """Least return, as a share of that in the training simulator."""
+    """Least return, as a share of that in the training simulator, or when its training ended if that is more."""
 
     def check(self) -> None:
         """Checks all values.

@@ -330,6 +330,11 @@ def load_policy(task: str, device: torch.device | str | None = None, protocol: s
     """
     if str(task).endswith(".safetensors"):
         raise ValueError(f"load_policy takes the id of a task; load a file with torchrl_loco.Policy.load({task!r})")
+    if Path(str(task)).is_dir():
+        raise ValueError(
+            f"load_policy takes the id of a task; load that of a run with torchrl_loco.training.RunFolder({task!r})"
+            ".load_policy()"
+        )
     name, shipped = canonical_id(task), shipped_policies(check_choice("protocol", protocol, PROTOCOLS))
     if name not in shipped:
         others = [f"protocol={other!r}" for other in PROTOCOLS if name in shipped_policies(other)]

@@ -271,7 +271,10 @@ def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
     if conditions.min_return is not None:
         raise ValueError("min_return is a share of the return in the training simulator: it cannot be asked for alone")
     if conditions.max_falls is None and not {"falls", "return"} & cls.holds.keys():
-        raise ValueError(f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone")
+        raise ValueError(
+            f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone, "
+            "but with max_falls"
+        )
 
 
 def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -> Outcome:
@@ -401,13 +404,13 @@ def _report(
     if kept is None and not bounds:
         kept = cls.holds.get("kept", 0.9)
     if kept is not None and here is not None:
-        trained = here["return"]
-        asked = DEFAULT.of(cls.holds)
-        if conditions == dataclasses.replace(asked, episodes=conditions.episodes, seed=conditions.seed):
-            trained = max(trained, exported.facts.get("info", {}).get("mean", trained))  # when its training ended
+        trained, where = here["return"], "in the training simulator"
+        ended = exported.facts.get("info", {}).get("mean", trained)
+        if ended > trained and conditions.seconds == DEFAULT.of(cls.holds).seconds:  # in episodes as long
+            trained, where = ended, "when its training ended"
         least = trained - (1.0 - kept) * abs(trained)
         words = f"return {there['return']:.1f}, at least {least:.1f} is asked for"
-        bounds.append((there["return"] >= least, f"{words}, {kept:.0%} of that in training"))
+        bounds.append((there["return"] >= least, f"{words}, {kept:.0%} of {trained:.1f} {where}"))
     holds = all(met for met, _ in bounds)
     words = "; ".join(text for met, text in bounds if met == holds)
     task, n, metrics = exported.facts["task"], there["episodes"], outcomes[ENGINES[0]].metrics

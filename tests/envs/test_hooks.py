@@ -14,7 +14,7 @@ from for_each import for_each
 from hook_tasks import DOG, Still, WalkBackwards, WalkBlindly
 from oracle import tolerance as numpy_tolerance
 
-from torchrl_loco import HopperStand, LocoEnv, SimConfig, State, Vary, WalkerWalk, training
+from torchrl_loco import Go1Velocity, HopperStand, LocoEnv, SimConfig, State, Vary, WalkerWalk, training
 from torchrl_loco.envs.fusion import trace
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
@@ -602,6 +602,8 @@ WRONG = [
     ({"update": lambda self, s: {"command": s.time}}, ValueError, "which has no entries"),
     ({"memory": {"comand": 3}, "events": lambda self, s: {"command": s.time}}, ValueError, "did you mean 'comand'"),
     ({"memory": {"a": 3}, "events": lambda self, s: {"a": s.qpos}}, ValueError, r"a of shape \(4, 3\)"),
+    ({"events": lambda self, s: {"qvel": s.qvel[:, :1]}}, ValueError, r"events must return qvel of shape \(4, \d+\)"),
+    ({"begin": lambda self, s: {"qpos": s.home[:1]}}, ValueError, r"begin must return qpos of shape \(4, \d+\)"),
     ({"memory": {"qpos": 3}}, ValueError, "'qpos' is taken"),
     ({"memory": {"a": 0}}, ValueError, "sizes of 1 or more"),
     ({"command_ranges": {"a": {"x": (0, 1)}}}, ValueError, "'a' is no entry of memory, which has none"),
@@ -621,6 +623,10 @@ WRONG = [
     ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
     ({"reward": lambda self, s: s.comand}, AttributeError, "memory, shared and constants have no entries"),
     ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
+    ({"reward": lambda self, s: s.model("kp")[:, 0]}, AttributeError, "gains are in actuator_gainprm"),
+    ({"reward": lambda self, s: s.normal(0.0, 1.0)}, TypeError, r"mean \+ deviation \* s\.normal"),
+    ({"reward": lambda self, s: s.normal(0, 1)}, TypeError, r"mean \+ deviation \* s\.normal"),
+    ({"model": mujoco.MjModel.from_xml_string(DOG)}, TypeError, "MJCF text or a mujoco.MjSpec, got <mujoco"),
     ({"reward": lambda self, s: s.joint_qpos(".*")[:, 0]}, ValueError, "name a free or ball joint alone"),
     (
         {"model": MAGNETIC, "reward": lambda self, s: s.sensor("unread")[:, 0], "engine": "compiled"},
@@ -628,6 +634,45 @@ WRONG = [
         "'unread'",
     ),
 ]
+
+
+def test_options_are_of_the_type_of_their_default():
+    """Text that was read from a file would count as True."""
+    options = {"on": (False, "whether"), "count": (3, "how many"), "most": (1.0, "how far")}
+    cls = type("Optional", (WalkerWalk,), {"options": options, "reward": lambda self, s: self.most * s.time})
+    for name, value in (("on", "False"), ("on", 1), ("count", 3.5), ("count", True), ("most", "fast"), ("most", None)):
+        with pytest.raises(
+            TypeError, match=rf"Optional: option '{name}' must be of type (bool|int|float), got {value!r}"
+        ):
+            cls(2, "cpu", **{name: value})
+    env = cls(2, "cpu", on=True, count=np.int64(4), most=2)
+    assert (env.on, env.count, env.most) == (True, 4, 2.0)
+    assert json.dumps(env.options_given) == '{"on": true, "count": 4, "most": 2.0}'
+
+
+def test_a_step_is_counted_in_whole_numbers():
+    """A time is a product of single precision: some quotients with the control step are below their number."""
+
+    class Counts(WalkerWalk):
+        def reward(self, s):
+            return s.step.float()
+
+        def truncated(self, s):
+            return s.step >= 30
+
+    env = Counts(2, "cpu", seed=0, sim_dt=0.025)
+    td = env.rollout(40, break_when_any_done=False)["next"]
+    assert td["reward"][0, :, 0].tolist() == [*range(1, 31), *range(1, 11)]
+    assert td["truncated"][0, :, 0].nonzero().tolist() == [[29]]
+
+
+def test_noise_of_a_class_above_is_said_to_be_that():
+    class Other(Go1Velocity):
+        def observation(self, s):
+            return {"observation": s.qpos}
+
+    with pytest.raises(ValueError, match=r"unknown Velocity.noise \(of which Other is a subclass, where noise = {} "):
+        Other(2, "cpu")
 
 
 class Commanded(WalkerWalk):

@@ -36,6 +36,7 @@ def test_wrong_seeds(tmp_path, capsys):
         "--seeds 0 -1": "each of seeds must lie in [0, 2**32)",
         "--seeds 1 x": "Error parsing --seeds",
         "--seed=3 --seeds 0 1": "pass one of them",
+        "--seeds": "--seeds must name at least one seed",
     }.items():
         with pytest.raises(SystemExit, match="2"):
             cli.main(["train", "walker_stand", "--device=cpu", f"--out={tmp_path}", *options.split()])

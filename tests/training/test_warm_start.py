@@ -8,6 +8,7 @@ from hook_tasks import Unsteady
 from small_runs import SMALL, made, networks, small_walker, trained
 from torch import nn
 
+import torchrl_loco
 from torchrl_loco import Go1Velocity, cli
 from torchrl_loco.cli import policies
 from torchrl_loco.collector import rewritten_by
@@ -54,6 +55,21 @@ def test_layers_of_another_kind_are_refused(tmp_path):
                 Trainer(made(tmp_path / init.stem, init=str(init)))
         with pytest.raises(ValueError, match=r"run with network of your own, which it does not hold: name .*policy"):
             policies.Which().load(str(own.checkpoint), "cpu")
+
+
+class Fewer(torchrl_loco.WalkerStand):
+    """Observes the pose alone."""
+
+    def observation(self, s):
+        return s.qpos
+
+
+def test_what_does_not_fit_is_named_and_a_shipped_policy_by_its_id(tmp_path):
+    with small_walker():
+        first = trained(tmp_path / "first")
+        with pytest.raises(ValueError, match=r"do not fit this run: observation 24, here 9$"):
+            Trainer(made(tmp_path / "second", task=Fewer, init=str(first.path)))
+    assert preset("walker_stand", "cpu", init="walker_walk").init.endswith("playground/walker_walk.safetensors")
 
 
 @for_each("kept", [{"elementwise_affine": False}, {"bias": False}])

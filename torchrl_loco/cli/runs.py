@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,21 @@ def train(options: Any, args: list[str]) -> None:
         if {"--seed", "--seeds"} <= {arg.partition("=")[0] for arg in args}:
             raise ValueError("--seed trains one seed, --seeds several: pass one of them")
         config, seeds, gpus = settings(options)
+        if "--seeds" in args and not seeds:
+            raise ValueError("--seeds must name at least one seed, as in --seeds 0 1 2")
         _check_seeds(seeds, gpus)
         missing = missing_processes(gpus, config.device)
     if missing:
         training.distributed.launch(missing, args)
         return
-    runs = [_trained(dataclasses.replace(config, seed=seed)) for seed in seeds or (config.seed,)]
+    runs = list[str]()
+    try:
+        for seed in seeds or (config.seed,):
+            runs.append(_trained(dataclasses.replace(config, seed=seed)))
+    except KeyboardInterrupt:
+        if left := seeds[len(runs) + 1 :]:
+            print(f"not begun: --seeds {' '.join(map(str, left))}", file=sys.stderr)
+        raise
     if seeds:
         print(f"all seeds in one picture: torchrl-loco plot {shlex.join(runs)}")
 

@@ -206,8 +206,10 @@ class Hooks:
         assert env is not None
         seen, memory = {name: shapes for name, shapes in self._shapes.items() if name != CRITIC}, self.catalog.memory
         known = list(dict.fromkeys(term for shapes in seen.values() for term in shapes))
+        base = next(base.__name__ for base in type(env).__mro__ if "noise" in vars(base))
+        of = "" if base == self._title else f" (of which {self._title} is a subclass, where noise = {{}} leaves it out)"
         for term, value in env.noise.items():
-            check_choice(f"{self._title}.noise", term, known)
+            check_choice(f"{base}.noise{of}", term, known)
             title = f"{self._title}.noise[{term!r}]"
             most, entry = value if isinstance(value, tuple) else (value, None)
             check_float(title, most, Interval(0.0, MAX_VALUE))
@@ -319,11 +321,11 @@ class Hooks:
                     f"{', '.join(known) or f'the names of {kind}, which has no entries'}"
                 )
             shape = (*first, *known[name].shape)
-            if not isinstance(row, torch.Tensor) or not _broadcasts(row.shape, shape):
+            if not isinstance(row, torch.Tensor) or tuple(row.shape) != shape:
                 raise ValueError(f"{self._title}.{hook} must return {name} of shape {shape}, got {_kind(row)}")
             if not torch.can_cast(row.dtype, known[name].dtype):
                 raise TypeError(f"{self._title}.{hook} must return {name} of {known[name].dtype}, got {row.dtype}")
-        return {name: row.expand((*first, *known[name].shape)) for name, row in rows.items()}
+        return dict(rows)
 
     def _check(self, hook: str, values: Any, shape: tuple[int, ...], name: str = "") -> None:
         what = f"{self._title}.{hook}{_of(name)} must return"
@@ -455,13 +457,6 @@ def beyond(*arrays: torch.Tensor) -> torch.Tensor:
     """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
     finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
-
-
-def _broadcasts(shape: torch.Size, target: tuple[int, ...]) -> bool:
-    """Returns whether rows have the dimensions that they must: each of the right size, or 1 where that is not 0."""
-    return len(shape) == len(target) and all(
-        one == other or (one == 1 and other > 0) for one, other in zip(shape, target, strict=True)
-    )
 
 
 def _kind(value: Any) -> str:

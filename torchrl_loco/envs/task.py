@@ -3,6 +3,7 @@
 import difflib
 import logging
 import math
+import numbers
 import sys
 from collections.abc import Mapping, Sequence
 from inspect import signature
@@ -361,7 +362,16 @@ class Task:
         """Returns values of :attr:`options` that are given, as a run keeps them: as JSON can hold them."""
         if given and not cls.options:
             raise ValueError(f"{cls.__name__} has no options, and so no {', '.join(given)}")
-        return {check_choice("option", name, cls.options): value for name, value in given.items()}
+        return {name: cls._option(check_choice("option", name, cls.options), value) for name, value in given.items()}
+
+    @classmethod
+    def _option(cls, name: str, value: Any) -> Any:
+        kind = type(cls.options[name][0])
+        if kind not in NUMBERS:
+            return value
+        if not isinstance(value, NUMBERS[kind]) or isinstance(value, bool) != (kind is bool):
+            raise TypeError(f"{cls.__name__}: option {name!r} must be of type {kind.__name__}, got {value!r}")
+        return kind(value)
 
     @classmethod
     def check_model(cls, mj_model: mujoco.MjModel) -> None:
@@ -370,6 +380,10 @@ class Task:
         Raises:
             ValueError: it has not.
         """
+
+
+NUMBERS: dict[type, type] = {bool: bool, int: numbers.Integral, float: numbers.Real}
+"""What the value of an option may be, by the type of its default; text and tuples are looked at by their task."""
 
 
 def options_of_class(cls: type[Task]) -> dict[str, Any]:

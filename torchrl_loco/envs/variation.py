@@ -280,5 +280,6 @@ def constant_of(mj_model: mujoco.MjModel, name: str) -> np.ndarray:
         arrays = [key for key in dir(mj_model) if isinstance(getattr(mj_model, key, None), np.ndarray)]
         near = difflib.get_close_matches(name, [*arrays, "gravity"], n=3)
         hint = f": did you mean {' or '.join(near)}?" if near else ""
+        hint = ", gains are in actuator_gainprm and actuator_biasprm" if name in ("kp", "kv") else hint
         raise AttributeError(f"MjModel has no array {name!r}{hint}")
     return values

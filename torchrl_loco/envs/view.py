@@ -209,6 +209,11 @@ class View:
         return (self._arrays["elapsed_steps"] + self._steps).float() * self._catalog.ctrl_dt
 
     @property
+    def step(self) -> torch.Tensor:
+        """Control steps of the episode's limit that are gone, ``(num_envs,)``, int64; exact, as :attr:`time` is not."""
+        return (self._arrays["elapsed_steps"] + self._steps).long()
+
+    @property
     def dt(self) -> float:
         """Time of a control step (s)."""
         return self._catalog.ctrl_dt
@@ -562,13 +567,22 @@ class View:
         return low + (high - low) * self._units_in(shape, 1)[0]
 
     def normal(self, *shape: int) -> torch.Tensor:
-        """Returns draws from the standard normal distribution, ``(num_envs, *shape)``; see :meth:`uniform`."""
+        """Returns draws from the standard normal distribution, ``(num_envs, *shape)``; see :meth:`uniform`.
+
+        Raises:
+            TypeError: the sizes are not whole numbers, as the mean and the deviation that torch takes.
+        """
         return draws.to_normal(*self._units_in(shape, 2))
 
     def _units_in(self, shape: Sequence[Any], count: int) -> list[torch.Tensor]:
         """Returns ``count`` draws from [0, 1) in a shape of each world: sizes, or one tuple of them."""
         if len(shape) == 1 and isinstance(shape[0], tuple | list):
             (shape,) = shape
+        if any(isinstance(size, float | torch.Tensor) for size in shape) or (count == 2 and 0 in shape):
+            raise TypeError(
+                f"a draw takes its sizes beyond that of the worlds, such as 3, got {', '.join(map(str, shape))}; "
+                "of another normal distribution is mean + deviation * s.normal(3)"
+            )
         size = int(math.prod(shape))
         return [rows.view(self.num_envs, *shape) for rows in self._units(count * size).split(size, dim=1)]
 

@@ -82,6 +82,8 @@ def specification(source: Path | str | mujoco.MjSpec, folder: Path | None = None
     """Returns what :func:`load` compiles, to be edited, or raises its errors; of a ``mujoco.MjSpec`` a copy."""
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
+    if not isinstance(source, Path | str):
+        raise TypeError(f"model must be a path of an MJCF file, MJCF text or a mujoco.MjSpec, got {source!r}")
     if isinstance(source, str) and source.lstrip().startswith("<"):
         return read_mjcf(source)
     path = _path(source, folder)

@@ -1,6 +1,7 @@
 """What all algorithms share: warm starts, and gradient steps over minibatches, recorded as a graph on CUDA."""
 
 import contextlib
+import dataclasses
 import importlib
 import math
 import re
@@ -392,7 +393,8 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         settings = run.load_config(), algorithm.config
         if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
-        networks = run.load_checkpoint(device, source if is_checkpoint else None)["algorithm"]["networks"]
+        checkpoint = run.load_checkpoint(device, source if is_checkpoint else None)
+        networks = checkpoint["algorithm"]["networks"]
         if "network" in run.given and run.policy.is_file():  # weights do not tell what lies between them
             theirs = layers_of(Policy.load(run.policy, device).module)
             for mine in map(layers_of_actor, algorithm.actors):
@@ -401,8 +403,10 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         try:
             algorithm.load_networks(networks)
         except (RuntimeError, KeyError) as error:
-            names = "algorithm", "task", *algorithm.config.widths
+            names = "algorithm", *algorithm.config.widths
             pairs = {name: [getattr(each, name, None) for each in settings] for name in names}
+            spaces = dataclasses.asdict(algorithm.spaces)
+            pairs |= {name: [size, spaces.get(name)] for name, size in checkpoint.get("spaces", {}).items()}
             differing = [f"{name} {old}, here {new}" for name, (old, new) in pairs.items() if old != new]
             why = ", ".join(differing) or str(error).splitlines()[-1].strip()
             raise ValueError(f"init: the networks of {source} do not fit this run: {why}") from error

@@ -102,7 +102,7 @@ class TrainingConfig:
     """Folder in which the run's own folder is made."""
 
     init: str = ""
-    """A policy file or a run folder whose weights the networks begin with; without one they are drawn."""
+    """A policy file, a run folder or the id of a shipped policy, whose weights the networks begin with; else drawn."""
     sim: Sim = AS_THE_TASK
     """Settings of the simulation that replace those of the task, such as ``{"iterations": 20}``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -197,7 +197,7 @@ class TrainingConfig:
         object.__setattr__(self, "size", checked_size(self.size))
         object.__setattr__(self, "sim", checked_sim(self.sim))
         object.__setattr__(self, "options", Options(self.options))
-        object.__setattr__(self, "init", str(Path(self.init).expanduser().resolve()) if self.init else "")
+        object.__setattr__(self, "init", self._path_of_init() if self.init else "")
         if not self.from_pixels:
             if needless := [each for each in OF_PIXELS if getattr(self, each) != getattr(TrainingConfig, each)]:
                 raise ValueError(f"{needless[0]} needs from_pixels=True")
@@ -231,6 +231,12 @@ class TrainingConfig:
     def label(self) -> str:
         """The name of the task for people and file systems, its id or the name of its class."""
         return label(self.task)
+
+    def _path_of_init(self) -> str:
+        from torchrl_loco.policy import shipped_policies  # which imports the simulation
+
+        path = Path(self.init).expanduser().resolve()
+        return str(path if path.exists() else shipped_policies(self.protocol).get(self.init, path))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
