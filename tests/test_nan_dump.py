@@ -219,7 +219,30 @@ def test_a_hook_that_gives_what_is_not_finite_is_told_from_the_physics(file, act
     with pytest.warns(NonFiniteWarning):
         env.close()
     *_, said = nan_dump.describe(nan_dump.load(file))
-    assert said.startswith("state, action and physics are finite: a hook gave what is not")
+    assert said == (
+        "state, action and physics are finite: a hook (control, reward, observation, memory) gave what is not"
+    )
+
+
+class Deep(torchrl_loco.WalkerWalk):
+    """One of two terms is the root of what is negative where a world has turned."""
+
+    def reward(self, s):
+        return {"alive": torch.ones_like(s.time), "depth": (0.5 - s.qpos[:, 2].abs()).sqrt()}
+
+
+def test_a_term_that_is_not_finite_is_named(file, actions):
+    env = Deep(WORLDS, "cpu", 7, nan_dump=file)
+    td = env.reset()
+    state = env.get_state()
+    state["qpos"][:, 2] = 0.0
+    state["qpos"][BAD, 2] = 1.0
+    td = env.reset(state, set_state=True)
+    stepped(env, td, actions(env, 1)[0])
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    *_, said = nan_dump.describe(nan_dump.load(file))
+    assert said == "state, action and physics are finite: reward['depth'] gave what is not"
 
 
 def test_a_state_written_from_outside_is_recognised(file):

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -189,4 +189,30 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     for name, at in zip(("Warp", "C MuJoCo"), lost, strict=True):
         yield f"{name}: " + (f"not finite after substep {at[0]}" if len(at) else "finite to the end")
     if not wrong and not len(lost[0]):
-        yield "state, action and physics are finite: a hook gave what is not (control, reward, observation, memory)"
+        gave = ", ".join(hooks_that_give_nan(dump, device)) or "a hook (control, reward, observation, memory)"
+        yield f"state, action and physics are finite: {gave} gave what is not"
+
+
+def hooks_that_give_nan(dump: NanDump, device: torch.device | str | None = None) -> list[str]:
+    """Returns which hooks in torch return what is not finite in the step, as ``reward['height']``."""
+    env, found = dump.make_env(device, compile_hooks=False), dict[str, None]()
+    assert env.hooks is not None
+    call = env.hooks._call
+
+    def watched(hook: str, *args: Any, **settings: Any) -> Any:
+        returned = call(hook, *args, **settings)
+        found.update(dict.fromkeys(_not_finite(hook, returned)))
+        return returned
+
+    td = env.reset(dump.state.to(env.device), set_state=True)
+    env.hooks._call = watched  # type: ignore[method-assign]
+    env.step(td.set("action", dump.tensors["action"][None].to(env.device)))
+    return list(found)
+
+
+def _not_finite(name: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _not_finite(f"{name}[{key!r}]", part)
+    elif isinstance(value, torch.Tensor) and value.is_floating_point() and not (value.abs() < MAX_VALUE).all():
+        yield name
