@@ -666,6 +666,20 @@ def test_a_step_is_counted_in_whole_numbers():
     assert td["truncated"][0, :, 0].nonzero().tolist() == [[29]]
 
 
+def test_what_hooks_read_must_be_there_when_the_environment_is_made():
+    class Late(WalkerWalk):
+        def __init__(self, *args, **settings):
+            super().__init__(*args, **settings)
+            self.scale = 2.0
+
+        def reward(self, s):
+            return self.scale * s.time
+
+    with pytest.raises(AttributeError, match="no attribute 'scale'") as raised:
+        Late(2, "cpu")
+    assert "set what they read of self before" in raised.value.__notes__[0]
+
+
 def test_noise_of_a_class_above_is_said_to_be_that():
     class Other(Go1Velocity):
         def observation(self, s):

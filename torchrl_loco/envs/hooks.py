@@ -118,8 +118,13 @@ class Hooks:
         shown = {**arrays, **self.catalog.constants, "home": self.catalog.home}
         before, own = {name: rows._version for name, rows in shown.items()}, dict(vars(env))
         of_model = {name: rows._version for name, rows in self.catalog.of_model.items()}
-        with reads_of(env) as self.read[hook]:
-            returned = getattr(env, hook)(view, *args)
+        try:
+            with reads_of(env) as self.read[hook]:
+                returned = getattr(env, hook)(view, *args)
+        except AttributeError as error:
+            if str(error).startswith(f"'{self._title}' object has no attribute"):
+                error.add_note("hooks are called while the environment is made: set what they read of self before that")
+            raise
         for name, version in before.items():
             if shown[name]._version != version:
                 raise ValueError(f"{self._title}.{hook} writes to s.{name.rpartition('.')[2]}: work on a clone")
