@@ -250,8 +250,9 @@ def test_a_policy_that_had_more_when_its_training_ended_does_not_hold(tmp_path):
     path = tmp_path / "kept.onnx"
     export_policy(constant(torchrl_loco.registry.task_name(Kept), 1, 6, 1.0, mean=80.0), path)
     for conditions, words in {
-        Conditions(episodes=2): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0 when its",
+        Conditions(episodes=2): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0",
         Conditions(episodes=2, delay=(2, 2)): "DOES NOT HOLD: return 38.0, at least 72.0 is asked for, 90% of 80.0",
+        Conditions(episodes=2, seconds=2.0): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0",
         Conditions(episodes=2, seconds=0.5): "holds: return 20.0, at least 18.0 is asked for, 90% of 20.0 in the",
     }.items():
         assert verify(path, conditions, "cpu").lines[-1].startswith(words)

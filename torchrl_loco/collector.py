@@ -160,6 +160,8 @@ class RolloutCollector:
             return False
         if self._recording.world is not self._base.world:
             self._recording, self._warm = None, False  # the environment was closed and opened again
+        elif self._carried is not self._recording.carried and self._lacks_entries():
+            self._recording, self._warm = None, False  # a policy's memory begins anew, as the policy says
         elif self._recording.has_other_weights():
             self._go_step_by_step(
                 "the policy's weights were replaced, or it changed between training and evaluation mode; update "
@@ -167,10 +169,16 @@ class RolloutCollector:
             )
         return self._recording is not None
 
+    def _lacks_entries(self) -> bool:
+        """Returns whether a batch is to begin without an entry that the recording begins with."""
+        assert self._recording is not None
+        assert self._carried is not None
+        return bool({*self._recording.carried.keys(True, True)} - {*self._carried.keys(True, True)})
+
     def _recorded_steps(self) -> list[TensorDictBase]:
         assert self._recording is not None
         if self._carried is not self._recording.carried:
-            self._recording.carried.zero_().update_(self._carried)  # a policy's memory begins at zero then
+            self._recording.carried.update_(self._carried)
         try:
             steps = self._recording.replay()
         except RuntimeError as error:

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from torch import nn
 
 from torchrl_loco import storage
-from torchrl_loco.checks import check_choice, check_device
+from torchrl_loco.checks import check_choice, check_device, is_run
 from torchrl_loco.config import PROTOCOLS
 from torchrl_loco.encoder import PixelEncoder
 from torchrl_loco.registry import canonical_id, resolve
@@ -330,12 +330,14 @@ def load_policy(task: str, device: torch.device | str | None = None, protocol: s
     """
     if str(task).endswith(".safetensors"):
         raise ValueError(f"load_policy takes the id of a task; load a file with torchrl_loco.Policy.load({task!r})")
-    if Path(str(task)).is_dir():
-        raise ValueError(
-            f"load_policy takes the id of a task; load that of a run with torchrl_loco.training.RunFolder({task!r})"
-            ".load_policy()"
-        )
-    name, shipped = canonical_id(task), shipped_policies(check_choice("protocol", protocol, PROTOCOLS))
+    shipped = shipped_policies(check_choice("protocol", protocol, PROTOCOLS))
+    try:
+        name = canonical_id(task)
+    except ValueError as error:
+        if not is_run(Path(str(task))):
+            raise
+        of_run = f"torchrl_loco.training.RunFolder({task!r}).load_policy()"
+        raise ValueError(f"load_policy takes the id of a task; load that of a run with {of_run}") from error
     if name not in shipped:
         others = [f"protocol={other!r}" for other in PROTOCOLS if name in shipped_policies(other)]
         raise ValueError(

@@ -131,8 +131,8 @@ def verify(
             env = _worlds(cls, exported, conditions, name, device)
         outcomes[name] = play(exported, env, conditions, name)
     assert env is not None
-    seconds = outcomes[ENGINES[0]].steps_of_episode * env.config.ctrl_dt
-    return _report(exported, cls, conditions, outcomes, seconds, cases)
+    steps, config = outcomes[ENGINES[0]].steps_of_episode, env.config
+    return _report(exported, cls, conditions, outcomes, steps * config.ctrl_dt, steps == config.episode_length, cases)
 
 
 def _by_case(
@@ -272,8 +272,7 @@ def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
         raise ValueError("min_return is a share of the return in the training simulator: it cannot be asked for alone")
     if conditions.max_falls is None and not {"falls", "return"} & cls.holds.keys():
         raise ValueError(
-            f"{cls.__name__} is held to its return in the training simulator: it cannot be played alone, "
-            "but with max_falls"
+            f"{cls.__name__} is held to its return in the training simulator: to play it alone, ask for max_falls"
         )
 
 
@@ -380,6 +379,7 @@ def _report(
     conditions: Conditions,
     outcomes: dict[str, Outcome],
     seconds: float,
+    whole: bool,
     cases: dict[str, dict[str, dict[str, Any]]],
 ) -> Report:
     """Returns whether a policy holds, and the figures by engine and kind of episodes."""
@@ -406,7 +406,7 @@ def _report(
     if kept is not None and here is not None:
         trained, where = here["return"], "in the training simulator"
         ended = exported.facts.get("info", {}).get("mean", trained)
-        if ended > trained and conditions.seconds == DEFAULT.of(cls.holds).seconds:  # in episodes as long
+        if ended > trained and whole:  # it was in whole episodes
             trained, where = ended, "when its training ended"
         least = trained - (1.0 - kept) * abs(trained)
         words = f"return {there['return']:.1f}, at least {least:.1f} is asked for"

@@ -9,7 +9,7 @@ from small_runs import SMALL, made, networks, small_walker, trained
 from torch import nn
 
 import torchrl_loco
-from torchrl_loco import Go1Velocity, cli
+from torchrl_loco import Go1Velocity, cli, load_policy
 from torchrl_loco.cli import policies
 from torchrl_loco.collector import rewritten_by
 from torchrl_loco.policy import Policy
@@ -64,12 +64,21 @@ class Fewer(torchrl_loco.WalkerStand):
         return s.qpos
 
 
-def test_what_does_not_fit_is_named_and_a_shipped_policy_by_its_id(tmp_path):
+def test_what_does_not_fit_is_named_and_a_shipped_policy_by_its_id(tmp_path, monkeypatch):
     with small_walker():
         first = trained(tmp_path / "first")
         with pytest.raises(ValueError, match=r"do not fit this run: observation 24, here 9$"):
             Trainer(made(tmp_path / "second", task=Fewer, init=str(first.path)))
-    assert preset("walker_stand", "cpu", init="walker_walk").init.endswith("playground/walker_walk.safetensors")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "walker_walk").mkdir()  # which is no run
+    for name in ("walker_walk", "mjx/walker_walk-v0"):
+        assert preset("walker_stand", "cpu", init=name).init.endswith("playground/walker_walk.safetensors")
+    (tmp_path / "walker_walk" / "config.json").touch()
+    assert preset("walker_stand", "cpu", init="walker_walk").init == str(tmp_path / "walker_walk")
+    assert load_policy("walker_walk", "cpu").info["task"] == "walker_walk"
+    (tmp_path / "walker_walk").rename(tmp_path / "mine")
+    with pytest.raises(ValueError, match=r"RunFolder\('mine'\).load_policy\(\)"):
+        load_policy("mine", "cpu")
 
 
 @for_each("kept", [{"elementwise_affine": False}, {"bias": False}])

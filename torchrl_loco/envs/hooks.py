@@ -123,7 +123,8 @@ class Hooks:
                 returned = getattr(env, hook)(view, *args)
         except AttributeError as error:
             if str(error).startswith(f"'{self._title}' object has no attribute"):
-                error.add_note("hooks are called while the environment is made: set what they read of self before that")
+                late = "hooks are called while the environment is made: set what they read of self before that"
+                error.add_note(f"did you mean s.{error.name}?" if error.name in PUBLIC else late)
             raise
         for name, version in before.items():
             if shown[name]._version != version:
@@ -211,7 +212,8 @@ class Hooks:
         assert env is not None
         seen, memory = {name: shapes for name, shapes in self._shapes.items() if name != CRITIC}, self.catalog.memory
         known = list(dict.fromkeys(term for shapes in seen.values() for term in shapes))
-        base = next(base.__name__ for base in type(env).__mro__ if "noise" in vars(base))
+        declares = next(base.__name__ for base in type(env).__mro__ if "noise" in vars(base))
+        base = self._title if "noise" in vars(env) else declares
         of = "" if base == self._title else f" (of which {self._title} is a subclass, where noise = {{}} leaves it out)"
         for term, value in env.noise.items():
             check_choice(f"{base}.noise{of}", term, known)

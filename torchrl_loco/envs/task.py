@@ -369,7 +369,7 @@ class Task:
         kind = type(cls.options[name][0])
         if kind not in NUMBERS:
             return value
-        if not isinstance(value, NUMBERS[kind]) or isinstance(value, bool) != (kind is bool):
+        if not isinstance(value, NUMBERS[kind]) or isinstance(value, bool | np.bool_) != (kind is bool):
             raise TypeError(f"{cls.__name__}: option {name!r} must be of type {kind.__name__}, got {value!r}")
         return kind(value)
 
@@ -382,7 +382,7 @@ class Task:
         """
 
 
-NUMBERS: dict[type, type] = {bool: bool, int: numbers.Integral, float: numbers.Real}
+NUMBERS: dict[type, Any] = {bool: bool | np.bool_, int: numbers.Integral, float: numbers.Real}
 """What the value of an option may be, by the type of its default; text and tuples are looked at by their task."""
 
 

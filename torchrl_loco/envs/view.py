@@ -578,12 +578,14 @@ class View:
         """Returns ``count`` draws from [0, 1) in a shape of each world: sizes, or one tuple of them."""
         if len(shape) == 1 and isinstance(shape[0], tuple | list):
             (shape,) = shape
-        if any(isinstance(size, float | torch.Tensor) for size in shape) or (count == 2 and 0 in shape):
+        if any(isinstance(size, float | torch.Tensor) for size in shape) or (len(shape) > 1 and shape[0] == 0):
+            scaled = "; of another normal distribution is mean + deviation * s.normal(3)" if count == 2 else ""
             raise TypeError(
-                f"a draw takes its sizes beyond that of the worlds, such as 3, got {', '.join(map(str, shape))}; "
-                "of another normal distribution is mean + deviation * s.normal(3)"
+                f"a draw takes its sizes beyond that of the worlds, such as 3, got {', '.join(map(str, shape))}{scaled}"
             )
         size = int(math.prod(shape))
+        if size == 0:
+            return [self.env_index.new_empty(self.num_envs, *shape, dtype=torch.float32)] * count
         return [rows.view(self.num_envs, *shape) for rows in self._units(count * size).split(size, dim=1)]
 
     def _units(self, count: int) -> torch.Tensor:

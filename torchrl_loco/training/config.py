@@ -23,10 +23,11 @@ from torchrl_loco.checks import (
     check_int,
     check_packages,
     checked_size,
+    is_run,
     within,
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig, arguments_of
-from torchrl_loco.registry import is_place, label, resolve, task_name
+from torchrl_loco.registry import ALIASES, is_place, label, resolve, task_name
 
 if TYPE_CHECKING:
     import torch
@@ -236,7 +237,8 @@ class TrainingConfig:
         from torchrl_loco.policy import shipped_policies  # which imports the simulation
 
         path = Path(self.init).expanduser().resolve()
-        return str(path if path.exists() else shipped_policies(self.protocol).get(self.init, path))
+        named = None if path.is_file() or is_run(path) else ALIASES.get(self.init, self.init)
+        return str(shipped_policies(self.protocol).get(named or "", path))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""

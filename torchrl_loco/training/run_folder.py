@@ -167,7 +167,7 @@ class RunFolder:
             config = config_from_json(json.loads(path.read_text()))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             why = "is damaged, from another release, of a task that is not installed, or of an algorithm of yours that "
-            why += "training.train was not given in this process"
+            why += "this process does not know (it does from training.train(..., algorithm=...) on)"
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
 

@@ -282,7 +282,7 @@ class Trainer:
             return
         raise NothingToLearnError(
             f"the networks of {self.run.path} are not finite after {self.frames} frames: a smaller lr may help, or "
-            "a look at the last rows of metrics.csv; an earlier checkpoint and policy stay"
+            "a look at the last rows of metrics.csv; what was saved before stays"
         )
 
     def _say_once(self, row: dict[str, float]) -> None:
