@@ -123,6 +123,9 @@ OPERATORS = {
         x.square(),
         x.reciprocal(),
         (x * 2).frac(),
+        (i + 16777217).floor(),
+        (i.long() + 2**53 + 1).ceil(),
+        (i - 16777217).trunc(),
     ),
     "atan2": lambda x, y, i, b: torch.atan2(x, y),
     "signs and lengths": lambda x, y, i, b: (
@@ -163,6 +166,10 @@ OPERATORS = {
         i // -4,
         (i.long() * 2**61) // 10**18,
         torch.div(x, 0.3, rounding_mode="trunc"),
+        x // torch.where(b, math.inf, y),
+        y // torch.where(b, -math.inf, 0 * x - 0.7),
+        i.long() >> (i.abs() + 61),
+        (i - 9) >> (i.abs() + 29),
     ),
     "comparisons": lambda x, y, i, b: (x < y, x <= 0.1, x > y, x >= y, x == x, x != y, i == 2, i > 1.5, b == (i > 0)),
     "logic": lambda x, y, i, b: (

@@ -650,6 +650,26 @@ def test_options_are_of_the_type_of_their_default():
     assert json.dumps(env.options_given) == '{"on": true, "count": 4, "most": 2.0}'
 
 
+@for_each("compile_hooks", [True, False])
+def test_an_index_beyond_a_table_ends_its_world_however_it_is_written(compile_hooks):
+    """Of integers, too, which have no NaN."""
+    ways = {
+        "brackets": lambda table, i: table[i],
+        "select": lambda table, i: table.index_select(0, i),
+        "named": lambda table, i: torch.index_select(table, dim=0, index=i),
+        "take": torch.take,
+        "embedding": lambda table, i: torch.nn.functional.embedding(i, table.unsqueeze(-1)).squeeze(-1),
+    }
+    for name, way in ways.items():
+        entries = {"constants": {"table": torch.tensor([10, 20, 30])}, "memory": {"seen": torch.int64}}
+        hooks = {"events": lambda self, s, way=way: {"seen": way(s.table, s.env_index)}}
+        env = type("Looks", (WalkerWalk,), {**entries, **hooks})(5, "cpu", seed=0, compile_hooks=compile_hooks)
+        td = env.rollout(1)["next"]
+        assert td["terminated"].flatten().tolist() == [False] * 3 + [True] * 2, name
+        assert env.health()["total"]["index_error"] == 2, name
+        assert env.get_state()["memory", "seen"][:3].tolist() == [10, 20, 30], name
+
+
 def test_a_step_is_counted_in_whole_numbers():
     """A time is a product of single precision: some quotients with the control step are below their number."""
 

@@ -105,8 +105,13 @@ class Table(torch.Tensor):
         first, alone = tables[0], len(tables) == len(leaves)
         if of_table and func is torch.Tensor.__getitem__:
             result = lookup(args[0], args[1], first._note)
-        elif of_table and func in (torch.index_select, torch.Tensor.index_select) and len(args) == 3:
-            result = lookup(args[0], (*[slice(None)] * (args[1] % args[0].ndim), args[2]), first._note)
+        elif of_table and func in (torch.index_select, torch.Tensor.index_select):
+            dim, index = args[1:] if args[2:] else (args[1] if args[1:] else kwargs["dim"], kwargs["index"])
+            result = lookup(args[0], (*[slice(None)] * (dim % args[0].ndim), index), first._note)
+        elif of_table and func in (torch.take, torch.Tensor.take) and not alone:
+            result = lookup(args[0].reshape(-1), args[1], first._note)
+        elif func is torch.nn.functional.embedding and args[1:] and not (of_table or alone):
+            result = lookup(args[1], args[0], first._note)
         else:
             result = func(*args, **kwargs)
         if not alone:

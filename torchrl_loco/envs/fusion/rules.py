@@ -21,9 +21,10 @@ LOG1P = (  # Warp's compiler for the CPU has neither this nor the next
     "1.0f + {0} == 1.0f ? {0} : 1.0f + {0} == {0} ? logf({0}) : logf(1.0f + {0}) * ({0} / ((1.0f + {0}) - 1.0f))"
 )
 EXPM1 = "fabsf({0}) > 0.5f ? expf({0}) - 1.0f : expf({0}) == 1.0f ? {0} : (expf({0}) - 1.0f) * ({0} / logf(expf({0})))"
-FUNCTIONS = "exp exp2 log log2 log10 sqrt sin cos tan asin acos atan sinh cosh tanh erf floor ceil trunc"
+FUNCTIONS = "exp exp2 log log2 log10 sqrt sin cos tan asin acos atan sinh cosh tanh erf"
 POINTWISE: dict[str, str | tuple[str, str]] = {
     **{name: f"{name}f({{0}})" for name in FUNCTIONS.split()},
+    **{name: (f"{name}f({{0}})", "{0}") for name in ("floor", "ceil", "trunc")},
     **{"atan2": "atan2f({0}, {1})", "log1p": LOG1P, "expm1": EXPM1},
     **{"rsqrt": "1.0f / sqrtf({0})", "reciprocal": "1.0f / {0}"},
     **{"sigmoid": "1.0f / (1.0f + expf(-{0}))", "relu": "{0} < 0 ? 0 : {0}", "neg": NEG, "mul": MUL},
@@ -33,8 +34,7 @@ POINTWISE: dict[str, str | tuple[str, str]] = {
     **{"sign": "{0} > 0 ? 1 : {0} < 0 ? -1 : 0", "minimum": LEAST, "maximum": MOST},
     **{"clamp_min": MOST, "clamp_max": LEAST, "fmod": ("fmodf({0}, {1})", "{1} == 0 ? 0 : {0} % {1}")},
     **{"bitwise_and": AND, "bitwise_or": OR, "bitwise_xor": "{0} ^ {1}", "bitwise_not": "~{0}"},
-    **{"bitwise_right_shift": "{0} >> {1}", "bitwise_left_shift": SHL},
-    **{"__and__": AND, "__or__": OR, "__xor__": "{0} ^ {1}", "__rshift__": "{0} >> {1}", "__lshift__": SHL},
+    **{"bitwise_left_shift": SHL, "__and__": AND, "__or__": OR, "__xor__": "{0} ^ {1}", "__lshift__": SHL},
 }
 """Operators whose operands are of the type of the result: C++ for floats, and for integers if that differs."""
 
@@ -76,6 +76,12 @@ def _add(text: str, p: Program, a: Any, b: Any, alpha: Any = 1) -> Value:
     return p.apply(text, dtype, a, b if alpha == 1 else p.apply(MUL, dtype, b, alpha))
 
 
+def _right_shift(p: Program, a: Any, b: Any) -> Value:
+    most = torch.iinfo(p._meta.dtype).bits - 1
+    by = "{1}" if isinstance(b, int) and 0 <= b <= most else f"({{1}} < 0 || {{1}} > {most} ? {most} : {{1}})"
+    return p.apply(f"{{0}} >> {by}", p._meta.dtype, a, b)  # beyond the width C++ says nothing
+
+
 def _remainder(p: Program, a: Any, b: Any) -> Value:
     return p.apply(REMAINDER, p._meta.dtype, _pointwise(POINTWISE["fmod"], p, a, b), b)
 
@@ -89,7 +95,9 @@ def _div(p: Program, a: Any, b: Any, rounding_mode: str | None = None) -> Value:
         return p.apply(f"{{1}} == 0 ? 0 : {{0}} / {{1}}{below}", dtype, a, b)
     if rounding_mode == "trunc":
         return p.apply("truncf({0} / {1})", dtype, a, b)
-    return p.apply("{1} == 0 ? {2} / {1} : rintf({0} / {1})", dtype, p.apply(SUB, dtype, a, _remainder(p, a, b)), b, a)
+    rest = _pointwise(POINTWISE["fmod"], p, a, b)  # with the sign of a: torch goes down by one where it is not b's
+    below = "(({0} - {2}) / {1} - ({2} != 0 && ({1} < 0) != ({2} < 0) ? 1.0f : 0.0f))"
+    return p.apply(f"{{1}} == 0 ? {{0}} / {{1}} : rintf({below})", dtype, a, b, rest)
 
 
 def _pow(p: Program, base: Any, exponent: Any) -> Value:
@@ -244,7 +252,7 @@ def _gather(p: Program, x: Any, dim: int, index: Any, sparse_grad: bool = False)
 
 
 def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
-    """Returns what each world looks up in a table: NaN (of integers 0) where an index is beyond its end."""
+    """Returns what each world looks up in a table: NaN (of integers the least) where an index is beyond its end."""
     dims = [dim for dim, index in enumerate(indices) if index is not None]
     shape = shape_of(x)
     values, world = p.aligned(*(p.cast(indices[dim], torch.int64) for dim in dims))
@@ -256,7 +264,9 @@ def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
         address = p.apply(ADD, torch.int64, address, p.apply(MUL, torch.int64, index, steps[dim]))
     rest = [dim for dim in range(len(shape)) if dim not in dims]
     offsets = offsets_of([shape[dim] for dim in rest], [steps[dim] for dim in rest])
-    nothing = "0" if dtype != torch.float32 else f"{INFINITE} - {INFINITE}"
+    nothing = f"{INFINITE} - {INFINITE}" if dtype == torch.float32 else "0"
+    if dtype not in (torch.float32, torch.bool):  # what shows, also where it is an index itself
+        nothing = f"(-{torch.iinfo(dtype).max}{'LL' * (dtype == torch.int64)} - 1)"
     made = np.empty((*address.array.shape, *offsets.shape), dtype=object)
     for at in np.ndindex(*address.array.shape):
         for of in np.ndindex(*offsets.shape):
@@ -398,6 +408,7 @@ RULES: dict[str, Callable[..., Any]] = {
     **{name: functools.partial(_fold, text) for name, text in FOLDS.items()},
     **{name: functools.partial(_filler, None if name.startswith("full") else 0) for name in FILLERS},
     **{"add": functools.partial(_add, ADD), "sub": functools.partial(_add, SUB), "remainder": _remainder, "div": _div},
+    **{"bitwise_right_shift": _right_shift, "__rshift__": _right_shift},
     **{"pow": _pow, "round": _round, "clamp": _clamp, "where": lambda p, *of: p.where(*of), "copy": _filled},
     **{"hypot": _hypot, "var": _var, "mean": _mean, "cumsum": _cumsum, "mm": _matmul, "bmm": _matmul},
     **{name: functools.partial(_extreme, name) for name in BEATS},
