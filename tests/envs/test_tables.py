@@ -1,5 +1,7 @@
 """Tables that worlds look up, what they share, numbers for the log, and hooks on top of Warp functions."""
 
+import itertools
+
 import pytest
 import torch
 from for_each import for_each
@@ -9,6 +11,7 @@ from tensordict import TensorDict
 import torchrl_loco
 from torchrl_loco import HopperHop, LocoEnv, State, WalkerWalk
 from torchrl_loco.envs.fixed_order import running_sum
+from torchrl_loco.envs.tables import lookup
 
 FRAMES = torch.arange(90_000.0).view(30_000, 3)
 
@@ -458,3 +461,22 @@ def test_built_in_starts_and_controls_can_be_built_on():
 def test_what_is_wrong_is_said(entries, error, message):
     with pytest.raises(error, match=message):
         type("Wrong", (WalkerWalk,), entries)(3, "cpu", 0, metrics=True)
+
+
+def test_a_table_is_indexed_as_torch_does_it():
+    """By numbers, slices, indices of worlds and such without dimensions, in all orders."""
+    table, worlds, pairs = torch.randn(3, 4, 2), torch.tensor([2, -1, 0, 1, 1]), torch.tensor([[0, 1], [1, 0], [0, 0]])
+    for index in itertools.product(
+        [slice(None), slice(1, 2), None, 0, ..., torch.tensor(1), worlds % 2, pairs], repeat=3
+    ):
+        if sum(part is Ellipsis for part in index) > 1:
+            continue
+        try:
+            expected = table[index]
+        except IndexError:
+            continue
+        lost = []
+        assert torch.equal(lookup(table, index, lambda worlds, _, lost=lost: lost.append(worlds.any())), expected), (
+            index
+        )
+        assert not any(lost)

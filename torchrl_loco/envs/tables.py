@@ -142,14 +142,25 @@ def lookup(table: torch.Tensor, index: Any, note: Note) -> torch.Tensor:
     parts = [each for part in parts for each in (rest if part is Ellipsis else [part])]
     table = table[tuple(slice(None) if _is_index(part) else part for part in parts)]  # as torch does it: first the rest
     parts = [part for part in parts if not isinstance(part, int)]
-    dims = [dim for dim, part in enumerate(parts) if _is_index(part)]
-    inside, safe = None, list[Any]([slice(None)] * (dims[-1] + 1))
-    for dim in dims:
+    inside = torch.ones(1, dtype=torch.bool, device=table.device)
+
+    def checked(dim: int) -> torch.Tensor:
+        nonlocal inside
         at, size = parts[dim].reshape(parts[dim].shape or (1,)), table.shape[dim]
         fits = (at >= -size) & (at < size)
-        safe[dim] = torch.where(fits, at, 0).long()
-        inside = fits if inside is None else inside & fits
-    assert inside is not None
+        inside = inside & fits
+        return torch.where(fits, at, 0).long()
+
+    dims = [dim for dim, part in enumerate(parts) if _is_index(part)]
+    if dims[-1] - dims[0] >= len(dims) and any(parts[dim].ndim for dim in dims):
+        # Where others lie between, torch goes by indices without dimensions first.
+        for dim in [dim for dim in reversed(dims) if not parts[dim].ndim]:
+            table = table.index_select(dim, checked(dim)).squeeze(dim)
+            del parts[dim]
+        dims = [dim for dim, part in enumerate(parts) if _is_index(part)]
+    safe = list[Any]([slice(None)] * (dims[-1] + 1))
+    for dim in dims:
+        safe[dim] = checked(dim)
     found = table[tuple(safe)]
     start = dims[0] if dims == list(range(dims[0], dims[-1] + 1)) else 0
     has_nan = found.is_floating_point()
