@@ -15,6 +15,7 @@ from torchrl_loco import storage
 from torchrl_loco.config import SimConfig
 from torchrl_loco.envs import LocoEnv, State
 from torchrl_loco.envs.episode import MAX_VALUE
+from torchrl_loco.envs.hooks import beyond
 from torchrl_loco.envs.monitors import NAN_DUMP
 from torchrl_loco.envs.vary import Vary
 from torchrl_loco.known_files import UnnamedFileError, place_of
@@ -214,5 +215,5 @@ def _not_finite(name: str, value: Any) -> Iterator[str]:
     if isinstance(value, Mapping):
         for key, part in value.items():
             yield from _not_finite(f"{name}[{key!r}]", part)
-    elif isinstance(value, torch.Tensor) and value.is_floating_point() and not (value.abs() < MAX_VALUE).all():
+    elif isinstance(value, torch.Tensor) and value.is_floating_point() and beyond(value).any():
         yield name

@@ -17,7 +17,7 @@ from tqdm.auto import trange
 
 from torchrl_loco.checks import check_bool, check_packages
 from torchrl_loco.conditions import DEFAULT, PUSH, PUSH_EVERY, Conditions
-from torchrl_loco.config import arguments_of
+from torchrl_loco.config import SimConfig, arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.task import folder_of
@@ -131,8 +131,7 @@ def verify(
             env = _worlds(cls, exported, conditions, name, device)
         outcomes[name] = play(exported, env, conditions, name)
     assert env is not None
-    steps, config = outcomes[ENGINES[0]].steps_of_episode, env.config
-    return _report(exported, cls, conditions, outcomes, steps * config.ctrl_dt, steps == config.episode_length, cases)
+    return _report(exported, cls, conditions, outcomes, env.config, cases)
 
 
 def _by_case(
@@ -378,14 +377,14 @@ def _report(
     cls: Any,
     conditions: Conditions,
     outcomes: dict[str, Outcome],
-    seconds: float,
-    whole: bool,
+    config: SimConfig,
     cases: dict[str, dict[str, dict[str, Any]]],
 ) -> Report:
     """Returns whether a policy holds, and the figures by engine and kind of episodes."""
     table = {
         engine: {name: played.of(rows) for name, rows in played.rows().items()} for engine, played in outcomes.items()
     }
+    steps = outcomes[ENGINES[0]].steps_of_episode
     there, here = (table.get(name, {}).get("all") for name in ENGINES)
     assert there is not None
     bounds = []
@@ -406,7 +405,7 @@ def _report(
     if kept is not None and here is not None:
         trained, where = here["return"], "in the training simulator"
         ended = exported.facts.get("info", {}).get("mean", trained)
-        if ended > trained and whole:  # it was in whole episodes
+        if ended > trained and steps == config.episode_length:  # it was in whole episodes
             trained, where = ended, "when its training ended"
         least = trained - (1.0 - kept) * abs(trained)
         words = f"return {there['return']:.1f}, at least {least:.1f} is asked for"
@@ -418,7 +417,7 @@ def _report(
     by_case = {} if cls.perfect else {engine: played.by_case() for engine, played in outcomes.items()}
     lines = [
         *_case_lines(cases),
-        f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {seconds:g} s, {_describe(conditions)}",
+        f"{task} in C MuJoCo {mujoco.__version__}, {episodes} of {steps * config.ctrl_dt:g} s, {_describe(conditions)}",
         *_lines_by_case(by_case.get(ENGINES[0], {}), metrics),
         *_lines(table, metrics),
         f"{'holds' if holds else 'DOES NOT HOLD'}: {words}",

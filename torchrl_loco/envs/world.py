@@ -77,7 +77,7 @@ class World:
         self._closed = True  # until it is made in full
         n, nu, hooks = task.num_envs, mj_model.nu, task.hooks
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
-        self._title, self._variation, self._as_they_are = type(task).__name__, task.variation, not task.compile_hooks
+        self._title, self._variation, self._records = type(task).__name__, task.variation, task.compile_hooks
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
         # the caller's default device. The caller's autocast is for the caller's own networks.
         with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
@@ -350,7 +350,7 @@ class World:
             assert world is not None
             getattr(world, name)()
 
-        if not several or not self.sim.device.is_cuda or self._as_they_are:
+        if not several or not self.sim.device.is_cuda or not self._records:
             return work
         graph, recorded = TorchGraph(work, self.sim.qpos.device, warmup=1), True
 

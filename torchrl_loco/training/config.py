@@ -234,11 +234,12 @@ class TrainingConfig:
         return label(self.task)
 
     def _path_of_init(self) -> str:
+        path = Path(self.init).expanduser().resolve()
+        if path.is_file() or is_run(path):
+            return str(path)
         from torchrl_loco.policy import shipped_policies  # which imports the simulation
 
-        path = Path(self.init).expanduser().resolve()
-        named = None if path.is_file() or is_run(path) else ALIASES.get(self.init, self.init)
-        return str(shipped_policies(self.protocol).get(named or "", path))
+        return str(shipped_policies(self.protocol).get(ALIASES.get(self.init, self.init), path))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the settings as values that JSON can hold, from which ``config_from_json`` makes them again."""
@@ -498,8 +499,8 @@ def check_packages_of(config: TrainingConfig) -> None:
 CONFIGS: dict[str, type[TrainingConfig]] = {config.algorithm: config for config in (PPOConfig, REPPOConfig, SVGConfig)}
 
 
-def register(kind: type[TrainingConfig]) -> None:
-    """Lets settings of an algorithm of a user be read by its name; in a notebook a cell may define them again.
+def register_config(kind: type[TrainingConfig]) -> None:
+    """Lets the settings of a user's algorithm be read by its name; a cell of a notebook may define them again.
 
     Raises:
         ValueError: the name is that of an algorithm of the package, which has other settings.

@@ -166,8 +166,10 @@ class RunFolder:
         try:
             config = config_from_json(json.loads(path.read_text()))
         except (ValueError, TypeError, LookupError, AttributeError) as error:
-            why = "is damaged, from another release, of a task that is not installed, or of an algorithm of yours that "
-            why += "this process does not know (it does from training.train(..., algorithm=...) on)"
+            why = (
+                "is damaged, from another release, of a task that is not installed, or of an algorithm of your own "
+                "that was not passed to training.train in this process"
+            )
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
 

@@ -24,7 +24,7 @@ from torchrl_loco.training.config import (
     check_setting,
     checked_sim,
     preset,
-    register,
+    register_config,
     tuning_note,
 )
 from torchrl_loco.training.environments import Given, unwrapped
@@ -83,7 +83,7 @@ def train(
     )
     cls: Any = task if given.env is None else type(unwrapped(given.env)[0])
     if given.algorithm is not None:
-        register(given.algorithm.config_type)  # by which the settings of the run are read again
+        register_config(given.algorithm.config_type)  # by which the settings of the run are read again
     chosen = {name: value for name, value in (("out", out), ("device", device)) if value is not None}
     if resume is not None:
         changes = settings | chosen

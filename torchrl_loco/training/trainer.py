@@ -49,7 +49,7 @@ ALGORITHMS: dict[str, type[Algorithm]] = {cls.config_type.algorithm: cls for cls
 
 
 class NothingToLearnError(ValueError):
-    """No step of a batch was finite, or networks are not any more."""
+    """No step of a batch was finite, or the networks are no longer finite."""
 
 
 class Trainer:
@@ -281,8 +281,8 @@ class Trainer:
         if all(bool(part.isfinite().all()) for part in self.algorithm.networks.parameters()):
             return
         raise NothingToLearnError(
-            f"the networks of {self.run.path} are not finite after {self.frames} frames: a smaller lr may help, or "
-            "a look at the last rows of metrics.csv; what was saved before stays"
+            f"the networks of {self.run.path} are not finite after {self.frames} frames: a smaller lr may help; "
+            "the last rows of metrics.csv tell since when; an earlier checkpoint and policy are not overwritten"
         )
 
     def _say_once(self, row: dict[str, float]) -> None:
@@ -581,7 +581,8 @@ class Trainer:
                     info = Policy.load(self.run.policy, "cpu").info
                 except ValueError as error:
                     raise ValueError(f"{error}. Move it away: the run goes on without") from error
-                if not self.environments.transforms or info.get("frames", 0) <= self.frames:  # else theirs are lost
+                if not self.environments.transforms or info.get("frames", 0) <= self.frames:
+                    # Else no checkpoint holds the transforms of its time.
                     self._best = info.get("selected_by", -math.inf)
             self._transforms_of_best = checkpoint.get("transforms_of_best", {})
         if not same_kind and distributed.is_first():

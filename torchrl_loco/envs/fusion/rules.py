@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchrl_loco.envs.fusion.nodes import ADD, LEAST, MOST, MUL, NEG, SHL, SUB, TYPES, WHERE, CannotFuse
-from torchrl_loco.envs.fusion.program import FILLERS, INFINITE, LONG, Program, Value, _shifted, offsets_of, shape_of
+from torchrl_loco.envs.fusion.program import FILLERS, LONG, Program, Value, _shifted, offsets_of, shape_of
 
 aten = torch.ops.aten
 
@@ -230,13 +230,17 @@ def _stack(p: Program, tensors: Sequence[Any], dim: int = 0) -> Any:
     return _cat(p, [_unsqueeze(p, x.with_array(x.array, world), dim) for x in values], dim)
 
 
+def _out_of_range(dtype: torch.dtype) -> Any:
+    """Returns what an index beyond the end gives: what shows, of integers also where it is an index itself."""
+    known = {torch.float32: math.nan, torch.bool: False}
+    return known[dtype] if dtype in known else torch.iinfo(dtype).min
+
+
 def _pick(p: Program, columns: Sequence[Any], index: Value) -> Value:
     """Returns of several values that of an index, which may be counted from the end."""
     if len(columns) > LONG:
         raise CannotFuse(f"{{op}} chooses among {len(columns)} numbers")
-    index, first = p.cast(index, torch.int64), p.value(columns[0])
-    nothing = {torch.float32: math.nan, torch.bool: False}  # out of range: what shows, also where it is an index itself
-    found = p.value(nothing[first.dtype] if first.dtype in nothing else torch.iinfo(first.dtype).min)
+    index, found = p.cast(index, torch.int64), p.value(_out_of_range(p.value(columns[0]).dtype))
     for i, column in enumerate(columns):
         chosen = p.apply(f"{{0}} == {i} || {{0}} == {i - len(columns)}", torch.bool, index, of=torch.int64)
         found = p.where(chosen, column, found)
@@ -264,14 +268,12 @@ def _looked_up(p: Program, x: Any, indices: Sequence[Any]) -> Value:
         address = p.apply(ADD, torch.int64, address, p.apply(MUL, torch.int64, index, steps[dim]))
     rest = [dim for dim in range(len(shape)) if dim not in dims]
     offsets = offsets_of([shape[dim] for dim in rest], [steps[dim] for dim in rest])
-    nothing = f"{INFINITE} - {INFINITE}" if dtype == torch.float32 else "0"
-    if dtype not in (torch.float32, torch.bool):  # what shows, also where it is an index itself
-        nothing = f"(-{torch.iinfo(dtype).max}{'LL' * (dtype == torch.int64)} - 1)"
+    nothing = p.constant(_out_of_range(dtype), dtype)
     made = np.empty((*address.array.shape, *offsets.shape), dtype=object)
     for at in np.ndindex(*address.array.shape):
         for of in np.ndindex(*offsets.shape):
-            text = f"{{0}} ? p{table}_0[{first + int(offsets[of])} + {{1}}] : {nothing}"
-            made[(*at, *of)] = p.node(text, dtype, inside.array[at], address.array[at], place=(table, None, 0))
+            text = f"{{0}} ? p{table}_0[{first + int(offsets[of])} + {{1}}] : {{2}}"
+            made[(*at, *of)] = p.node(text, dtype, inside.array[at], address.array[at], nothing, place=(table, None, 0))
     start, count = dims[0] if dims == list(range(dims[0], dims[-1] + 1)) else 0, address.array.ndim
     return Value(np.moveaxis(made, range(count), range(start, start + count)), dtype, _shifted(world, start))
 
