@@ -197,6 +197,42 @@ def test_a_level_that_is_clamped_is_carried_on_too():
     assert Plateau(1, "cpu", 0).hooks.carried == ("level",)
 
 
+class NextLevel(Levels):
+    """Chooses its next level at each step, in an entry of its own, from how far it came."""
+
+    memory = {"level": (), "next_level": (), "way": (), "best": ()}
+
+    def update(self, s):
+        return {"way": s.way + 2.0}
+
+    def events(self, s):
+        return {"next_level": s.level + s.way}
+
+    def begin(self, s):
+        return {"level": s.next_level, "best": torch.maximum(s.best, s.next_level)}
+
+
+class ByWay(Levels):
+    """Its next level is made from the last one and how far it came, and its place from the level."""
+
+    memory = {"level": (), "way": (), "place": ()}
+
+    def begin(self, s):
+        level = torch.where(s.way > 2.0, s.level + 1.0, s.level)
+        return {"level": level, "place": 8.0 * level}
+
+
+def test_a_level_that_another_entry_becomes_is_carried_on():
+    """An entry that begins from itself stands for what else it is made from, which a cut-off episode falsifies."""
+    env = NextLevel(2, "cpu", 0)
+    assert env.hooks.carried == ("next_level", "best")
+    assert ByWay(1, "cpu", 0).hooks.carried == ("level",)
+    env.rollout(3, Still(env))
+    env.close()
+    env.reset()
+    assert env.get_state()["memory", "level"].tolist() == [6.0, 6.0]
+
+
 def test_a_closed_environment_goes_on_at_its_stage():
     env = Levels(2, "cpu", 0)
     env.rollout(4, Still(env))

@@ -286,8 +286,10 @@ class WorldAccess(Task, EnvBase):
     def get_stage(self) -> dict[str, Any]:
         """Returns how far a curriculum has come, as JSON can hold it: what episodes go on from.
 
-        That is :attr:`shared`, and of :attr:`memory` the entries that :meth:`begin` makes from their former values, as
-        a level, in at most 64 worlds, evenly spread. Training keeps it with checkpoint and policy.
+        That is :attr:`shared`, and of :attr:`memory` the entries from which :meth:`begin` makes the memory of the next
+        episode, as a level from its former value or from an entry of its own, in at most 64 worlds, evenly spread.
+        Where an entry begins from itself, what else it is made from is left out: it is of an episode that may not be
+        over. Training keeps the stage with checkpoint and policy.
         """
         return self._stage_of(min(self.num_envs, STAGE_WORLDS))
 

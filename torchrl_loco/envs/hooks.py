@@ -54,6 +54,18 @@ def reads_of(env: Any) -> Iterator[set[str]]:
         object.__setattr__(env, "__class__", cls)
 
 
+class Noting(dict[str, torch.Tensor]):
+    """Arrays of all worlds, with the entries of memory that were read."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        super().__init__(arrays)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        self.read.add(name.removeprefix("memory."))
+        return super().__getitem__(name)
+
+
 class Hooks:
     """The hooks of an environment's task that are plain torch.
 
@@ -199,11 +211,11 @@ class Hooks:
         self.moves = bool(pose.keys() & rows.keys())
         self._remember(arrays, {name: row for name, row in rows.items() if name in memory})
         self._adapted(arrays)
-        rows = self._rows("begin", arrays, {**memory, **pose})
+        rows = self._rows("begin", noting := Noting(arrays), {**memory, **pose})
         for name, row in rows.items():
             if not row.isfinite().all():
                 raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
-        self.carried = tuple(name for name in rows if name in memory and self._is_carried(name, arrays, rows[name]))
+        self.carried = self._carried(noting, rows)
         self.groups = {name: tuple(values.shape[1:]) for name, values in self._groups(arrays).items()}
         self._declare_noise_and_history()
 
@@ -236,19 +248,29 @@ class Hooks:
                 self.catalog.memory[HISTORY.format(group)] = Entry((count, size), torch.float32)
                 self.history[group], self.groups[group] = count, (count * size,)
 
-    def _is_carried(self, name: str, arrays: Arrays, row: torch.Tensor) -> bool:
-        """Returns whether ``begin`` makes something else of an entry of memory where it held something else."""
-        key = f"memory.{name}"
-        held = arrays[key]
+    def _carried(self, arrays: "Noting", begun: Mapping[str, torch.Tensor]) -> tuple[str, ...]:
+        """Returns the entries of memory from which ``begin`` makes entries of memory: a level, or the next level.
+
+        One that begins from itself stands for whatever else its next value is made from, such as a distance so far.
+        """
+        made = {entry: self._made_from(entry, arrays, begun) for entry in self.catalog.memory if entry in arrays.read}
+        of_themselves = [rows for entry, rows in made.items() if entry in rows]
+        explained = set[str]().union(*of_themselves)
+        return tuple(entry for entry, rows in made.items() if entry in rows or rows - explained)
+
+    def _made_from(self, entry: str, arrays: Arrays, begun: Mapping[str, torch.Tensor]) -> set[str]:
+        """Returns the entries of memory that ``begin`` makes otherwise where an entry held something else."""
+        key, kept = f"memory.{entry}", begun.keys() & self.catalog.memory.keys()
+        held, found = arrays[key], set[str]()
         # Of several numbers some may be clamped.
         for other in [~held] if held.dtype == torch.bool else [held + by for by in (1, 3, 10, 100, -1)]:
             try:
-                again = self._call("begin", {**arrays, key: other})[name]
+                again = self._call("begin", {**arrays, key: other})
             except Exception:  # it refuses that number, so it reads it
-                return True
-            if not torch.equal(again.expand_as(row).nan_to_num(), row.nan_to_num()):
-                return True
-        return False
+                return {entry} if entry in kept else kept
+            pairs = {name: (again[name].expand_as(begun[name]), begun[name]) for name in kept}
+            found |= {name for name, pair in pairs.items() if not torch.equal(*(rows.nan_to_num() for rows in pair))}
+        return found
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
         """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise."""
