@@ -848,24 +848,46 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
         type("Moved", (LocoEnv,), entries)(1, "cpu", 0)
 
 
+@contextlib.contextmanager
+def autocast():
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        yield
+
+
+@contextlib.contextmanager
+def float64():
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@for_each("caller", [autocast, float64])
 @for_each("compile_hooks", [True, False])
-def test_the_callers_autocast_is_for_the_callers_own_networks(compile_hooks, caplog):
+def test_the_callers_precision_is_for_the_callers_own_networks(compile_hooks, caller, caplog):
     """Neither where an environment is made in it nor where it is stepped; sorted numbers make no kernel."""
 
     class Mixed(WalkerWalk):
+        randomize = [Vary("dof_armature", 0.9, 1.1, of="(left|right)_hip")]
+
         def observation(self, s):
             return {"observation": s.qpos.sort(-1).values @ s.uniform(0, 1, 9, 4)[0]}
 
         def reward(self, s):
-            return (s.qpos @ s.qvel.T).diagonal()
+            return (s.qpos @ s.qvel.T).diagonal() * torch.tensor([1.1, 1.2, 1.3]) / torch.tensor(3.0)
 
-    seen = []
-    for made, stepped in ((False, False), (True, True)):
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=made):
+    action, seen, kinds = torch.full((3, 6), 0.3), [], []
+    for made, stepped in ((contextlib.nullcontext, contextlib.nullcontext), (caller, caller)):
+        with made():
             env = Mixed(3, "cpu", 0, world_offset=0, compile_hooks=compile_hooks)
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=stepped):
-            seen.append(env.rollout(3, lambda td: td.set("action", torch.full((3, 6), 0.3))))
+            kinds.append((env.world.kinds, env.world._vary.kind))
+        with stepped():
+            assert (torch.get_default_dtype() == torch.float64) == (stepped is float64)
+            seen.append(env.rollout(3, lambda td: td.set("action", action)))
+            assert (torch.get_default_dtype() == torch.float64) == (stepped is float64)
     assert (seen[0] == seen[1]).all()
+    assert kinds[0] == kinds[1]
     assert "bfloat16" not in caplog.text
     assert "its trace gives another" not in caplog.text
 

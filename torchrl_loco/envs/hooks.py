@@ -11,6 +11,7 @@ import torch
 from torchrl_loco.checks import Interval, check_choice, check_float, check_int, suggestion
 from torchrl_loco.envs.episode import MAX_VALUE
 from torchrl_loco.envs.fixed_order import fixed_order
+from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.rotations import unit_quaternions
 from torchrl_loco.envs.state import State, by_world
@@ -112,7 +113,7 @@ class Hooks:
         self._pose = {"qpos": Entry((mj_model.nq,), torch.float32), "qvel": Entry((mj_model.nv,), torch.float32)}
         self.read: dict[str, set[str]] = {}  # by hook, the attributes of the environment that it reads
         if self.own:
-            with torch.no_grad(), torch.autocast(env.device.type, enabled=False):
+            with torch.no_grad(), own_precision(env.device):
                 self._probe(self._at_home())
         self.catalog.complete = True
 

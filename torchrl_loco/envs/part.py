@@ -15,6 +15,7 @@ import warp as wp
 import torchrl_loco
 from torchrl_loco.envs.fusion import CannotFuse, ReachedError, fuse, trace
 from torchrl_loco.envs.hooks import Arrays
+from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Simulation
 
@@ -57,11 +58,11 @@ class Part:
         self.before: Callable[[], None] = lambda: None  # makes what it reads, such as scans of the ground
 
     def _in_own_precision(self, work: Callable[..., None]) -> Callable[..., None]:
-        """Returns what does the same under the caller's autocast, which is for the caller's own networks."""
-        kind = next(iter(self._arrays.values())).device.type
+        """Returns what does the same under the caller's autocast and default dtype."""
+        device = next(iter(self._arrays.values())).device
 
         def run(*args: Any) -> None:
-            with torch.autocast(kind, enabled=False):
+            with own_precision(device):
                 work(*args)
 
         return run

@@ -151,7 +151,7 @@ class Variation:
             bounds = [change.vary.bounds[group] for group in change.group_of]
             ends = torch.tensor(bounds, dtype=torch.float64, device=device).T
             low, high = (ends.log() if change.vary.log else ends)[:, None]
-            signs = torch.tensor([change.signs], device=device)
+            signs = torch.tensor([change.signs], dtype=torch.float32, device=device)
             sources = self._index([latest[column] for column in columns])
             self._steps.append((sources, self._index(change.which), low.float(), (high - low).float(), signs))
             for i, column in enumerate(columns):

@@ -23,6 +23,7 @@ from torchrl_loco.envs.hooks import PARTS, Arrays, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.pixels import Seen
+from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.envs.scan import Scans
 from torchrl_loco.envs.state import State
 from torchrl_loco.envs.view import CONTACT_HISTORY
@@ -79,8 +80,8 @@ class World:
         self._ctrl_dt, self._own = task.config.ctrl_dt, hooks.own
         self._title, self._variation, self._records = type(task).__name__, task.variation, task.compile_hooks
         # Buffers made in inference mode could not be written outside it; without the device, torch's views would be on
-        # the caller's default device. The caller's autocast is for the caller's own networks.
-        with torch.inference_mode(False), EXCLUSIVE, task.device, torch.autocast(task.device.type, enabled=False):
+        # the caller's default device.
+        with torch.inference_mode(False), EXCLUSIVE, task.device, own_precision(task.device):
             geoms, history = hooks.catalog.contact_geoms, not hooks.catalog.arrays.isdisjoint(CONTACT_HISTORY)
             asked: dict[str, Any] = {"contact_geoms": geoms, "contact_history": history}
             varied = task.variation.varied if task.variation else None
