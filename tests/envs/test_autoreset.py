@@ -156,6 +156,29 @@ def test_worlds_go_on_beside_one_that_is_not_finite():
     assert not torch.equal(held["observation"][0], after["observation"][0])
 
 
+class Steadied(torchrl_loco.WalkerWalk):
+    """Its controls follow the forces of the ground in the last step."""
+
+    def control(self, s, action):
+        force = s.contact_force("(torso|.*_(thigh|leg|foot))", history=True)[..., 2]
+        return action + 1e-3 * force.flatten(1).mean(-1, keepdim=True)
+
+
+def test_a_world_that_waits_goes_on_under_the_forces_of_its_last_step():
+    env = Steadied(2, "cpu", 0)
+    actions = 2 * torch.rand(60, 2, 6, generator=torch.Generator().manual_seed(0)) - 1
+    reached = []
+    for waits in (False, True):
+        env.set_seed(0)
+        td = env.reset()
+        for i, action in enumerate(actions):
+            if waits and i % 5 == 4:
+                td = env.step(td.set("action", action).set("_step", torch.tensor([[True], [False]])))["next"]
+            td = env.step(td.set("action", action))["next"]
+        reached.append(td["observation"][1])
+    assert torch.equal(*reached)
+
+
 def test_worlds_of_a_lazy_stack(shared):
     """As TorchRL stacks TensorDicts of single worlds."""
     ends = []

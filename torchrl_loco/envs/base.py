@@ -35,7 +35,7 @@ from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
-from torchrl_loco.envs.state import State, without_state
+from torchrl_loco.envs.state import State, by_world, without_state
 from torchrl_loco.envs.task import BOUNDED, folder_of, options_of_class, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
@@ -324,10 +324,12 @@ class LocoEnv(WorldAccess, QuickResets):
         The worlds cannot be stepped apart: the others are stepped too, without control, and put back. What all share
         stays, unless all are stepped.
         """
-        before, held = self.get_state(), ~part
+        before, felt, held = self.get_state(), [rows.clone() for rows in self.world.felt], ~part
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
         after = self._outputs(Seen.step, with_reward=True)
         self._set_state(before, held, finite=False)  # one of them may have been not finite
+        for rows, kept in zip(self.world.felt, felt, strict=True):
+            rows.copy_(torch.where(by_world(held, rows), kept, rows))
         stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
         return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 
@@ -404,8 +406,14 @@ class LocoEnv(WorldAccess, QuickResets):
         return result
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
-        return super()._reset_proc_data(without_state(tensordict, self.device), tensordict_reset)
+        """Returns what ``reset`` returns: without a state that was passed, which would become stale.
+
+        Worlds that are not reset keep the entries that were passed; TorchRL would pad those that were not with zeros.
+        """
+        passed = without_state(tensordict, self.device)
+        if passed is not None and "_reset" in passed:
+            passed.update(tensordict_reset.exclude(*passed.keys(True, True)))
+        return super()._reset_proc_data(passed, tensordict_reset)
 
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""

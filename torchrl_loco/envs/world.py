@@ -45,6 +45,9 @@ from torchrl_loco.sim.models import FORCE_SENSORS
 if TYPE_CHECKING:
     from torchrl_loco.envs.base import LocoEnv
 
+FELT = ("contact_force", "in_contact", *CONTACT_HISTORY, "sensordata")
+"""Arrays of hooks that a state does not give again: forces are those of the last step."""
+
 
 class World:
     """The worlds of an environment on their device: simulation, buffers, monitors and graphs.
@@ -70,6 +73,7 @@ class World:
         seed: seed of all random streams, ``(1,)``.
         seen: what draws the pixels, if the environment returns any.
         health: counts what went wrong in the physics.
+        felt: what only a step measures, of what hooks read: contact forces and sensors, tensors ``(nworld, ...)``.
         kinds: by hook of the task in torch, how it runs: see ``Part.kind`` in ``part.py``.
         fixed: attributes of the task that were read when this was made, and never again.
     """
@@ -229,6 +233,7 @@ class World:
         self._moved = Buffer(task.num_envs, bool, sim.device)
         self._scans = Scans(sim, hooks.catalog.scans, lambda: hooks.catalog.ground)
         arrays = self._arrays(task)
+        self.felt = [arrays[name] for name in FELT if name in arrays]
 
         parts: dict[Part, set[str]] = {}  # and what attributes of the task each reads
         of_hook: dict[str, Part] = {}
