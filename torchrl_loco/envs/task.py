@@ -1,11 +1,11 @@
 """What a task is: its attributes, its hooks with their defaults, and what is checked of them. No TorchRL."""
 
 import difflib
+import functools
 import logging
 import math
-import numbers
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from torchrl_loco.checks import check_choice, check_int, check_pair
+from torchrl_loco.checks import ANY, EXTENDED, check_bool, check_choice, check_float, check_int, check_pair
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.config import SimConfig, options_of
 from torchrl_loco.envs.episode import MAX_VALUE
@@ -366,12 +366,8 @@ class Task:
 
     @classmethod
     def _option(cls, name: str, value: Any) -> Any:
-        kind = type(cls.options[name][0])
-        if kind not in NUMBERS:
-            return value
-        if not isinstance(value, NUMBERS[kind]) or isinstance(value, bool | np.bool_) != (kind is bool):
-            raise TypeError(f"{cls.__name__}: option {name!r} must be of type {kind.__name__}, got {value!r}")
-        return kind(value)
+        check = NUMBERS.get(type(cls.options[name][0]))
+        return value if check is None else check(f"{cls.__name__}: option {name!r}", value)
 
     @classmethod
     def check_model(cls, mj_model: mujoco.MjModel) -> None:
@@ -382,8 +378,12 @@ class Task:
         """
 
 
-NUMBERS: dict[type, Any] = {bool: bool | np.bool_, int: numbers.Integral, float: numbers.Real}
-"""What the value of an option may be, by the type of its default; text and tuples are looked at by their task."""
+NUMBERS: dict[type, Callable[[str, Any], Any]] = {
+    bool: check_bool,
+    int: functools.partial(check_int, interval=ANY),
+    float: functools.partial(check_float, interval=EXTENDED),
+}
+"""What looks at the value of an option, by the type of its default; text and tuples are looked at by their task."""
 
 
 def options_of_class(cls: type[Task]) -> dict[str, Any]:
