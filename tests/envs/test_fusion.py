@@ -145,7 +145,17 @@ OPERATORS = {
         torch.diagonal(y.view(-1, 2, 3), 1, 1, 2),
         (x + y).unfold(1, 3, 2).amax(-1),
     ),
-    "powers": lambda x, y, i, b: (x**2, x**3, x**7, x**-1, x**-2, x**0.5, x.abs() ** 1.5, x.abs() ** y, 2.0**x, i**2),
+    "powers": lambda x, y, i, b: (
+        *(x**2, x**3, x**7, x**-1, x**-2, x**0.5, x**-0.5, (i * -0.0) ** 0.5, (i * -0.0) ** -0.5),
+        *(x.abs() ** 1.5, x.abs() ** y, 2.0**x, i**2),
+    ),
+    "constants of other types": lambda x, y, i, b: (
+        i + torch.full_like(i, 3_000_000_000).int(),
+        i + torch.full_like(i, 16777217).float().long(),
+        i + torch.full_like(x, 16777217.0).long(),
+        x + torch.full_like(x, -2.9).int(),
+        torch.full_like(i, -256).bool() & b,
+    ),
     "limits": lambda x, y, i, b: (
         x.clamp(-0.5, 0.5),
         x.clamp(min=0.1),

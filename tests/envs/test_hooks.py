@@ -671,6 +671,24 @@ def test_an_index_beyond_a_table_ends_its_world_however_it_is_written(compile_ho
         assert env.get_state()["memory", "seen"][:3].tolist() == [10, 20, 30], name
 
 
+@for_each(
+    "table", [torch.tensor([10, 20, 30]), torch.tensor([1, 2, 3], dtype=torch.int32), torch.tensor([0.1, 0.2, 0.3])]
+)
+def test_an_index_beyond_a_tensor_of_the_task_ends_its_world(table):
+    """In a kernel; plain torch raises its error for all worlds."""
+    look_up = lambda self, s: {"seen": self.rows[(s.qpos[:, 1] > 100.0).long() * 7]}  # noqa: E731
+    entries = {"memory": {"seen": table.dtype}, "rows": table, "events": look_up}
+    env = type("Looks", (WalkerWalk,), entries)(3, "cpu", seed=0)
+    assert env.world.kinds["events"] == "kernel"
+    td = env.reset()
+    env.sim.qpos[2, 1] = 200.0
+    assert env.step(td.set("action", torch.zeros(3, 6)))["next", "terminated"].flatten().tolist() == [
+        False,
+        False,
+        True,
+    ]
+
+
 def test_a_step_is_counted_in_whole_numbers():
     """A time is a product of single precision: some quotients with the control step are below their number."""
 

@@ -415,7 +415,7 @@ class Hooks:
                 values = values.flatten(1)
             a[f"out.{name}"].copy_(values)
         outputs = [a[name] for name in a if name.startswith("out.")]
-        memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind.is_floating_point]
+        memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind != torch.bool]
         wrong = a["non_finite"] | beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs) | self._lost(a)
         a["non_finite"].copy_(wrong)
         for values in (*outputs, a["reward"], a["terms"], *([a["metrics"]] if self.metric_names else [])):
@@ -484,8 +484,15 @@ NO_GROUPS = (*("reward", "done", "terminated", "truncated", "action", "next", "_
 
 
 def beyond(*arrays: torch.Tensor) -> torch.Tensor:
-    """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
-    finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
+    """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that.
+
+    The lowest integer is what a kernel gives for an index beyond a tensor of integers.
+    """
+    rows = [values.flatten(1) if values.ndim > 1 else values.unsqueeze(1) for values in arrays]
+    finite = [
+        values.abs() < MAX_VALUE if values.is_floating_point() else values != torch.iinfo(values.dtype).min
+        for values in rows
+    ]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
 
 

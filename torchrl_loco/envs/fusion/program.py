@@ -118,10 +118,11 @@ class Program:
     def constant(self, number: Any, dtype: torch.dtype) -> Node:
         """Returns a constant."""
         if dtype == torch.float32:
-            plain = math.isfinite(np.float32(number))
-            text = literal(number) if plain else INFINITE if number > 0 else f"(-{INFINITE})"
+            with np.errstate(over="ignore"):
+                number = float(np.float32(number))
+            text = literal(number) if math.isfinite(number) else INFINITE if number > 0 else f"(-{INFINITE})"
             text = f"({INFINITE} - {INFINITE})" if number != number else f"({text})"
-            return self.node(text, dtype, number=float(number))
+            return self.node(text, dtype, number=number)
         if dtype == torch.bool:
             return self.node(str(bool(number)).lower(), dtype, number=bool(number))
         text = f"(-{2**63 - 1}LL - 1)" if number == -(2**63) else f"({int(number)}LL)"
@@ -155,7 +156,7 @@ class Program:
 
         def convert(node: Node) -> Node:
             if node.number is not None and math.isfinite(node.number):
-                return self.constant(node.number, dtype)
+                return self.constant(torch.tensor(node.number, dtype=node.dtype).to(dtype).item(), dtype)
             return self.node("{0} != 0" if dtype == torch.bool else f"({TYPES[dtype]}){{0}}", dtype, node)
 
         if x.dtype == dtype:
