@@ -143,7 +143,7 @@ def row(run: Path) -> Row:
         for simulator, where in (("C MuJoCo", ""), ("training simulator", ", training simulator")):
             for episodes, which in (("all", ""), ("delay 0", ", on time")):
                 figures = outcomes.get(simulator, {}).get(episodes, {})
-                names = {"linear_error": "error (m/s)", "angular_error": "error (rad/s)"}
+                names = {"linear_error": "error (m/s)", "angular_error": "error (rad/s)", "return": "return, verified"}
                 found |= {f"{names.get(key, key)}{which}{where}": value for key, value in figures.items()}
     return found
 

@@ -71,41 +71,33 @@ TRAINED = {
     "go1_rough": "a Go1 learns to walk over rough ground",
     "g1_tracking": "a G1 learns to follow a motion",
 }
-
-
-class Runs(NamedTuple):
-    """Training runs of a task: the folders that hold its seeds, and runs that had their GPU to themselves.
-
-    ``alone`` names folder, task, protocol and seeds (None: all) of those runs, where they are not the same ones.
-    """
-
-    folders: Sequence[str]
-    alone: tuple[str, str, str, str | None] | None = None
-
-
 SEEDS = ("2026-11-23/h200-presets/campaign", "2026-11-23/h200-seeds/campaign")
 FIRST, ALONE, LAST = "2026-11-23/h200/campaign", "2026-11-23/h200-alone/campaign", "2026-11-24/h200-alone/campaign"
 FURTHER, RUN = "2026-11-22/h200-runners/campaign", "2026-11-24/h100/walker-run"
-RUNS = {
-    ("walker_stand", "playground"): Runs(SEEDS, (ALONE, "walker_stand", "playground", None)),
-    ("walker_walk", "playground"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
-    ("walker_run", "playground"): Runs([RUN]),
-    ("humanoid_stand", "playground"): Runs(SEEDS, (FIRST, "humanoid_stand", "playground", None)),
-    ("humanoid_walk", "playground"): Runs(SEEDS, (FIRST, "humanoid_walk", "playground", None)),
-    ("humanoid_run", "playground"): Runs([FIRST, SEEDS[1]], (FIRST, "humanoid_run", "playground", None)),
-    ("cheetah_run", "playground"): Runs([FURTHER]),
-    ("hopper_stand", "playground"): Runs([FURTHER]),
-    ("hopper_hop", "playground"): Runs([FURTHER]),
-    ("quadruped_walk", "playground"): Runs([FURTHER]),
-    ("quadruped_run", "playground"): Runs([FURTHER]),
-    ("walker_stand", "dm_control"): Runs(SEEDS, (ALONE, "walker_stand", "dm_control", None)),
-    ("walker_walk", "dm_control"): Runs(SEEDS, (SEEDS[1], "walker_walk", "playground", "4")),
-    ("walker_run", "dm_control"): Runs([RUN]),
-    ("humanoid_stand", "dm_control"): Runs([*SEEDS, ALONE], (ALONE, "humanoid_stand", "dm_control", None)),
-    ("humanoid_walk", "dm_control"): Runs([*SEEDS, ALONE], (ALONE, "humanoid_walk", "dm_control", None)),
-    ("humanoid_run", "dm_control"): Runs([FIRST, ALONE, LAST], (ALONE, "humanoid_run", "dm_control", None)),
+RUNS: dict[tuple[str, str], Sequence[str]] = {
+    ("walker_stand", "playground"): SEEDS,
+    ("walker_walk", "playground"): SEEDS,
+    ("walker_run", "playground"): [RUN],
+    ("humanoid_stand", "playground"): SEEDS,
+    ("humanoid_walk", "playground"): SEEDS,
+    ("humanoid_run", "playground"): [FIRST, SEEDS[1]],
+    ("cheetah_run", "playground"): [FURTHER],
+    ("hopper_stand", "playground"): [FURTHER],
+    ("hopper_hop", "playground"): [FURTHER],
+    ("quadruped_walk", "playground"): [FURTHER],
+    ("quadruped_run", "playground"): [FURTHER],
+    ("walker_stand", "dm_control"): SEEDS,
+    ("walker_walk", "dm_control"): SEEDS,
+    ("walker_run", "dm_control"): [RUN],
+    ("humanoid_stand", "dm_control"): [*SEEDS, ALONE],
+    ("humanoid_walk", "dm_control"): [*SEEDS, ALONE],
+    ("humanoid_run", "dm_control"): [FIRST, ALONE, LAST],
 }
-"""The runs of the presets, by task and protocol."""
+"""Folders of the seeds that the presets were trained with, by task and protocol."""
+ALONE_NOW = "2026-11-30/h200-runners"
+"""Runs that had their GPU to themselves, one for each task, which tell how long it trains."""
+LIKE = {"hopper_stand": "hopper_hop"}
+"""A task without such a run, and the one of the same body whose speed it has."""
 TASKS = [task for task, protocol in RUNS if protocol == "playground"]
 
 
@@ -118,7 +110,7 @@ def tables() -> dict[str, str]:
         "collected": of_bodies(COLLECTED, RUNNERS[:2]),
         "speed": speed(),
         "trained": trained(),
-        "returns": returns() + sources([[f"{path}/results.csv" for path in runs.folders] for runs in RUNS.values()]),
+        "returns": returns() + sources([[f"{path}/results.csv" for path in folders] for folders in RUNS.values()]),
         "tasks": tasks.overview(),
         "variation": variation(),
         "fields": fields.fields(),
@@ -222,12 +214,11 @@ def by_worlds() -> str:
 
 def training(task: str) -> list[tuple[str, str]]:
     """Returns lines for the page of a task: what policies of its preset earn, and how long they train."""
-    runs = RUNS[task, "playground"]
-    seeds = seeds_of(task, "playground", runs)
+    seeds = seeds_of(task, "playground")
     earned = f"{_mean(seeds, 'mean'):.0f} on average over {len(seeds)} seeds"
     return [
         ("return after training", earned),
-        ("training (s)", f"{time_of_training(task, 'playground', runs)}, on one GPU"),
+        ("training (s)", f"{time_of_training(task, 'playground')}, on one GPU"),
     ]
 
 
@@ -235,8 +226,8 @@ def returns() -> str:
     """Returns the returns of all runs, beside the published ones and those of shipped policies in dm_control."""
     suite = {row["task"]: row for row in _json(SUITE) if row["where"] == "dm_control"}
     rows = []
-    for (task, protocol), runs in RUNS.items():
-        seeds = seeds_of(task, protocol, runs)
+    for task, protocol in RUNS:
+        seeds = seeds_of(task, protocol)
         under = protocol if (task, protocol) in PUBLISHED else "dm_control"
         published, by = PUBLISHED[task, under]
         there = suite[task] if protocol == "dm_control" else None
@@ -247,7 +238,7 @@ def returns() -> str:
                 f"{_mean(seeds, 'mean'):.1f}",
                 ", ".join(f"{float(row['mean']):.0f}" for row in seeds),
                 f"{_mean(seeds, 'frames') / 1e6:.0f}",
-                time_of_training(task, protocol, runs),
+                time_of_training(task, protocol),
                 f"{there['mean']:.1f} +- {there['std']:.1f}" if there else "",
                 f"{by} {published}{'' if under == protocol else f' ({under})'}",
             )
@@ -291,24 +282,19 @@ def variation() -> str:
     return table(head, [(row["policy"], *(f"{row[key]:.0f}" for key in keys)) for row in _json(VARIATION)])
 
 
-def seeds_of(task: str, protocol: str, runs: Runs) -> list[dict[str, str]]:
+def seeds_of(task: str, protocol: str) -> list[dict[str, str]]:
     """Returns the rows of results of a task's runs, one for each seed, by seed."""
-    rows = [row for folder in runs.folders for row in _results(folder, task, protocol)]
+    rows = [row for folder in RUNS[task, protocol] for row in _results(folder, task, protocol)]
     by_seed = {row["seed"]: row for row in reversed(rows)}  # the first folder that has a seed counts
     return [by_seed[seed] for seed in sorted(by_seed, key=int)]
 
 
-def time_of_training(task: str, protocol: str, runs: Runs) -> str:
-    """Returns the seconds that a run takes on a GPU of its own, with ~ where runs of another length tell its speed."""
-    frames = _mean(seeds_of(task, protocol, runs), "frames")
-    if runs.alone is None:
-        alone = seeds_of(task, protocol, runs)
-    else:
-        folder, *key, seed = runs.alone
-        alone = [row for row in _results(folder, *key) if seed in (None, row["seed"])]
-    seconds = _mean(alone, "seconds") * frames / _mean(alone, "frames")
-    same = runs.alone is None or runs.alone[1:3] == (task, protocol)
-    return f"{'' if same and frames == _mean(alone, 'frames') else '~'}{seconds:.0f}"
+def time_of_training(task: str, protocol: str) -> str:
+    """Returns the seconds that a run takes on a GPU of its own, with ~ where another run tells its speed."""
+    frames = _mean(seeds_of(task, protocol), "frames")
+    (alone,) = _results(ALONE_NOW, LIKE.get(task, task), protocol)
+    of_alone = float(alone["frames"])
+    return f"{'' if frames == of_alone else '~'}{float(alone['seconds']) * frames / of_alone:.0f}"
 
 
 def _results(folder: str, task: str, protocol: str) -> list[dict[str, str]]:
@@ -350,9 +336,8 @@ def draw(picture: Path) -> None:
     figure = Figure(figsize=(11, 7.2), layout="constrained")
     panels = figure.subplots(3, 4).flat
     for task, axes in zip(TASKS, panels, strict=False):
-        runs = RUNS[task, "playground"]
-        rows = [row for folder in runs.folders for row in read(RESULTS / folder, "evaluations.csv")]
-        for seed in seeds_of(task, "playground", runs):
+        rows = [row for folder in RUNS[task, "playground"] for row in read(RESULTS / folder, "evaluations.csv")]
+        for seed in seeds_of(task, "playground"):
             key = (task, "playground", seed["seed"])
             found = [row for row in rows if (row["task"], row["protocol"], row["seed"]) == key]
             points = [(float(row["frames"]) / 1e6, float(row["mean"])) for row in found]

@@ -16,8 +16,8 @@ from torchrl_loco.policy import shipped_policies
 Row = dict[str, Any]
 ROOT = Path(__file__).parents[2]
 ALL = ROOT / "benchmarks" / "results"
-RESULTS = (ALL / "2026-11-26" / "h100-robots",)
-"""Trained by today's presets, and by mjlab."""
+RESULTS = (ALL / "2026-11-30" / "h200-robots", ALL / "2026-11-26" / "h100-robots")
+"""Trained by today's presets; by those of before, with more seeds, by REPPO and by mjlab."""
 CURVES = ROOT / "docs" / "_static" / "robots.png"
 MOVING = ROOT / "docs" / "_static" / "robots.webp"
 GPUS = {"H100": "#f5a623", "H200": "#c2571a"}
