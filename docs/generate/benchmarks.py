@@ -231,19 +231,22 @@ def returns() -> str:
         under = protocol if (task, protocol) in PUBLISHED else "dm_control"
         published, by = PUBLISHED[task, under]
         there = suite[task] if protocol == "dm_control" else None
+        alone = _alone(task, protocol)
+        whole = float(alone["frames"]) == _mean(seeds, "frames")
         rows.append(
             (
                 task,
                 protocol,
                 f"{_mean(seeds, 'mean'):.1f}",
                 ", ".join(f"{float(row['mean']):.0f}" for row in seeds),
+                f"{float(alone['mean']):.0f}" if whole else "",
                 f"{_mean(seeds, 'frames') / 1e6:.0f}",
                 time_of_training(task, protocol),
                 f"{there['mean']:.1f} +- {there['std']:.1f}" if there else "",
                 f"{by} {published}{'' if under == protocol else f' ({under})'}",
             )
         )
-    columns = ("task", "protocol", "mean", "by seed", "million frames", "training (s)")
+    columns = ("task", "protocol", "mean", "by seed", "today", "million frames", "training (s)")
     return table((*columns, "shipped policy in dm_control", "published"), rows)
 
 
@@ -291,10 +294,15 @@ def seeds_of(task: str, protocol: str) -> list[dict[str, str]]:
 
 def time_of_training(task: str, protocol: str) -> str:
     """Returns the seconds that a run takes on a GPU of its own, with ~ where another run tells its speed."""
-    frames = _mean(seeds_of(task, protocol), "frames")
-    (alone,) = _results(ALONE_NOW, LIKE.get(task, task), protocol)
-    of_alone = float(alone["frames"])
-    return f"{'' if frames == of_alone else '~'}{float(alone['seconds']) * frames / of_alone:.0f}"
+    frames, alone = _mean(seeds_of(task, protocol), "frames"), _alone(task, protocol)
+    seconds = float(alone["seconds"]) * frames / float(alone["frames"])
+    return f"{'' if frames == float(alone['frames']) else '~'}{seconds:.0f}"
+
+
+def _alone(task: str, protocol: str) -> dict[str, str]:
+    """Returns the run that had its GPU to itself, of a task or of the one like it."""
+    (row,) = _results(ALONE_NOW, LIKE.get(task, task), protocol)
+    return row
 
 
 def _results(folder: str, task: str, protocol: str) -> list[dict[str, str]]:
