@@ -232,7 +232,7 @@ def returns() -> str:
         published, by = PUBLISHED[task, under]
         there = suite[task] if protocol == "dm_control" else None
         alone = _alone(task, protocol)
-        whole = float(alone["frames"]) == _mean(seeds, "frames")
+        whole = alone["task"] == task and float(alone["frames"]) == _mean(seeds, "frames")
         rows.append(
             (
                 task,
@@ -296,7 +296,8 @@ def time_of_training(task: str, protocol: str) -> str:
     """Returns the seconds that a run takes on a GPU of its own, with ~ where another run tells its speed."""
     frames, alone = _mean(seeds_of(task, protocol), "frames"), _alone(task, protocol)
     seconds = float(alone["seconds"]) * frames / float(alone["frames"])
-    return f"{'' if frames == float(alone['frames']) else '~'}{seconds:.0f}"
+    whole = alone["task"] == task and float(alone["frames"]) == frames
+    return f"{'' if whole else '~'}{seconds:.0f}"
 
 
 def _alone(task: str, protocol: str) -> dict[str, str]:

@@ -173,7 +173,10 @@ def test_a_world_that_waits_goes_on_under_the_forces_of_its_last_step():
         td = env.reset()
         for i, action in enumerate(actions):
             if waits and i % 5 == 4:
-                td = env.step(td.set("action", action).set("_step", torch.tensor([[True], [False]])))["next"]
+                part = td.select("done").set("action", action).set("_step", torch.tensor([[True], [False]]))
+                after = env.step(part)["next"]
+                assert torch.equal(after["observation"][1], td["observation"][1])  # which was not passed
+                td = after
             td = env.step(td.set("action", action))["next"]
         reached.append(td["observation"][1])
     assert torch.equal(*reached)

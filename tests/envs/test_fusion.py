@@ -147,7 +147,7 @@ OPERATORS = {
     ),
     "powers": lambda x, y, i, b: (
         *(x**2, x**3, x**7, x**-1, x**-2, x**0.5, x**-0.5, (i * -0.0) ** 0.5, (i * -0.0) ** -0.5),
-        *(x.abs() ** 1.5, x.abs() ** y, 2.0**x, i**2),
+        *(x.abs() ** 1.5, x.abs() ** y, 2.0**x, i**2, x ** torch.tensor([-0.5, 0.5]).repeat(3)),
     ),
     "constants of other types": lambda x, y, i, b: (
         i + torch.full_like(i, 3_000_000_000).int(),
@@ -155,6 +155,7 @@ OPERATORS = {
         i + torch.full_like(x, 16777217.0).long(),
         x + torch.full_like(x, -2.9).int(),
         torch.full_like(i, -256).bool() & b,
+        torch.full_like(x, 3e9).int().bool() & b,
     ),
     "limits": lambda x, y, i, b: (
         x.clamp(-0.5, 0.5),

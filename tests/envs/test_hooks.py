@@ -4,6 +4,7 @@ import contextlib
 import functools
 import json
 import math
+import threading
 
 import mujoco
 import numpy as np
@@ -19,6 +20,7 @@ from torchrl_loco.envs.fusion import trace
 from torchrl_loco.envs.fusion.rules import RULES
 from torchrl_loco.envs.hooks import own_hooks
 from torchrl_loco.envs.part import Part
+from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.envs.view import View
 
 SENSORS = ("gyro", "velocimeter", "attitude", "sole_in_trunk", "sole_velocity", "shank_rotation", "geom_axis")
@@ -621,6 +623,8 @@ WRONG = [
     ({"reward": lambda self, s: {}}, ValueError, "tensors by name"),
     ({"observation": lambda self, s: {"memory": s.qpos}}, ValueError, "'memory' is no name"),
     ({"memory": {"a": 4}, "begin": lambda self, s: {"a": s.time}}, ValueError, r"a of shape \(4, 4\)"),
+    ({"control": lambda self, s, action: s.ctrl + action}, ValueError, r"last controls in memory.*update\(\)"),
+    ({"control": lambda self, s, action: s.actuator_force}, ValueError, "last controls in memory"),
     ({"reward": lambda self, s: s.comand}, AttributeError, "memory, shared and constants have no entries"),
     ({"reward": lambda self, s: s.model("geom_fiction")}, AttributeError, "no array 'geom_fiction'"),
     ({"reward": lambda self, s: s.model("kp")[:, 0]}, AttributeError, "gains are in actuator_gainprm"),
@@ -671,22 +675,19 @@ def test_an_index_beyond_a_table_ends_its_world_however_it_is_written(compile_ho
         assert env.get_state()["memory", "seen"][:3].tolist() == [10, 20, 30], name
 
 
-@for_each(
-    "table", [torch.tensor([10, 20, 30]), torch.tensor([1, 2, 3], dtype=torch.int32), torch.tensor([0.1, 0.2, 0.3])]
-)
-def test_an_index_beyond_a_tensor_of_the_task_ends_its_world(table):
-    """In a kernel; plain torch raises its error for all worlds."""
+@for_each("table", [torch.tensor([10, 20, 30]), torch.tensor([0.1, 0.2, 0.3])])
+def test_an_index_beyond_a_tensor_of_the_task_shows(table):
+    """In a kernel; plain torch raises its error for all worlds. NaN ends a world; integers have the lowest number."""
     look_up = lambda self, s: {"seen": self.rows[(s.qpos[:, 1] > 100.0).long() * 7]}  # noqa: E731
     entries = {"memory": {"seen": table.dtype}, "rows": table, "events": look_up}
     env = type("Looks", (WalkerWalk,), entries)(3, "cpu", seed=0)
     assert env.world.kinds["events"] == "kernel"
     td = env.reset()
     env.sim.qpos[2, 1] = 200.0
-    assert env.step(td.set("action", torch.zeros(3, 6)))["next", "terminated"].flatten().tolist() == [
-        False,
-        False,
-        True,
-    ]
+    after = env.step(td.set("action", torch.zeros(3, 6)))["next"]
+    ended, *_, last = after["terminated"].flatten().tolist(), env.get_state()["memory", "seen"][2]
+    assert ended == [False, False, table.is_floating_point()]
+    assert last.isnan() if table.is_floating_point() else last == torch.iinfo(table.dtype).min
 
 
 def test_a_step_is_counted_in_whole_numbers():
@@ -884,31 +885,61 @@ def float64():
 
 @for_each("caller", [autocast, float64])
 @for_each("compile_hooks", [True, False])
-def test_the_callers_precision_is_for_the_callers_own_networks(compile_hooks, caller, caplog):
+@for_each("play", [False, True])
+def test_the_callers_precision_is_for_the_callers_own_networks(play, compile_hooks, caller, caplog):
     """Neither where an environment is made in it nor where it is stepped; sorted numbers make no kernel."""
 
     class Mixed(WalkerWalk):
+        memory = {"speed": 1}
+        command_ranges = {"speed": {"m/s": (0.0, 1.0)}}
         randomize = [Vary("dof_armature", 0.9, 1.1, of="(left|right)_hip")]
 
         def observation(self, s):
             return {"observation": s.qpos.sort(-1).values @ s.uniform(0, 1, 9, 4)[0]}
 
+        def events(self, s):
+            return {"speed": s.speed + 1.0}
+
         def reward(self, s):
+            if play:  # a kernel, with commands that can be set
+                return s.speed[:, 0] * torch.tensor(0.1)
             return (s.qpos @ s.qvel.T).diagonal() * torch.tensor([1.1, 1.2, 1.3]) / torch.tensor(3.0)
 
     action, seen, kinds = torch.full((3, 6), 0.3), [], []
     for made, stepped in ((contextlib.nullcontext, contextlib.nullcontext), (caller, caller)):
         with made():
-            env = Mixed(3, "cpu", 0, world_offset=0, compile_hooks=compile_hooks)
-            kinds.append((env.world.kinds, env.world._vary.kind))
+            env = Mixed(3, "cpu", 0, world_offset=0, compile_hooks=compile_hooks, play=play)
+            kinds.append({**env.world.kinds, "vary": getattr(env.world._vary, "kind", None)})
         with stepped():
             assert (torch.get_default_dtype() == torch.float64) == (stepped is float64)
             seen.append(env.rollout(3, lambda td: td.set("action", action)))
             assert (torch.get_default_dtype() == torch.float64) == (stepped is float64)
     assert (seen[0] == seen[1]).all()
     assert kinds[0] == kinds[1]
+    assert kinds[0]["events"] == ("kernel" if play and compile_hooks else "plain torch")
     assert "bfloat16" not in caplog.text
     assert "its trace gives another" not in caplog.text
+
+
+def test_the_callers_default_dtype_is_back_when_the_last_thread_leaves():
+    """Torch has one for all threads: the first that leaves must not take it from the others."""
+    inside, leave, found = threading.Event(), threading.Event(), []
+
+    def first():
+        with own_precision(torch.device("cpu")):
+            inside.set()
+            leave.wait(10.0)
+
+    with float64():
+        thread = threading.Thread(target=first)
+        thread.start()
+        assert inside.wait(10.0)
+        with own_precision(torch.device("cpu")):
+            leave.set()
+            thread.join()
+            found.append(torch.get_default_dtype())
+        found.append(torch.get_default_dtype())
+    assert found == [torch.float32, torch.float64]
 
 
 def test_a_group_of_what_warp_observes_is_a_kernel():

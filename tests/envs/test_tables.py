@@ -212,21 +212,42 @@ class NextLevel(Levels):
         return {"level": s.next_level, "best": torch.maximum(s.best, s.next_level)}
 
 
-class ByWay(Levels):
-    """Its next level is made from the last one and how far it came, and its place from the level."""
+def climbed(s):
+    return torch.where(s.way > 2.0, s.level + 1.0, s.level)
 
-    memory = {"level": (), "way": (), "place": ()}
 
-    def begin(self, s):
-        level = torch.where(s.way > 2.0, s.level + 1.0, s.level)
-        return {"level": level, "place": 8.0 * level}
+PLACES = torch.tensor([0.0, 8.0, 16.0])
+BEGINNINGS = {  # what is in memory, what begin() makes of it, and what a stage carries on
+    "an entry that begins from itself stands for what else it is made from, which a cut-off episode falsifies": (
+        *({"level": (), "way": (), "place": ()}, lambda s: {"level": climbed(s), "place": PLACES[climbed(s).long()]}),
+        ("level",),
+    ),
+    "successes in a row, which a failure ends, do not show at zero": (
+        *({"way": (), "wins": ()}, lambda s: {"wins": torch.where(s.way > 2.0, s.wins + 1.0, 0.0)}),
+        ("wins",),
+    ),
+    "an index of a table of poses may be no more than that": (
+        {"level": torch.int64, "which": torch.int64},
+        lambda s: {"level": s.uniform(0.0, 2.0).long(), "qpos": s.home + PLACES[:2, None].expand(2, 7)[s.which]},
+        (),
+    ),
+    "other entries after another level": (
+        *({"level": ()}, lambda s: {"level": s.level} if (s.level == 0.0).all() else {}),
+        ("level",),
+    ),
+}
+
+
+@for_each("name", list(BEGINNINGS))
+def test_what_is_carried_on(name):
+    memory, begin, carried = BEGINNINGS[name]
+    entries = {"memory": memory, "begin": lambda self, s: begin(s)}
+    assert type("Begun", (HopperHop,), entries)(1, "cpu", 0).hooks.carried == carried
 
 
 def test_a_level_that_another_entry_becomes_is_carried_on():
-    """An entry that begins from itself stands for what else it is made from, which a cut-off episode falsifies."""
     env = NextLevel(2, "cpu", 0)
     assert env.hooks.carried == ("next_level", "best")
-    assert ByWay(1, "cpu", 0).hooks.carried == ("level",)
     env.rollout(3, Still(env))
     env.close()
     env.reset()

@@ -325,12 +325,13 @@ class LocoEnv(WorldAccess, QuickResets):
         stays, unless all are stepped.
         """
         before, felt, held = self.get_state(), [rows.clone() for rows in self.world.felt], ~part
+        passed = tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False)
+        stay = self._skip_tensordict(self._outputs(lambda seen: {}).update(passed))
         self.world.step(action.masked_fill(held.unsqueeze(-1), 0.0), adapts=not held.any())
         after = self._outputs(Seen.step, with_reward=True)
         self._set_state(before, held, finite=False)  # one of them may have been not finite
         for rows, kept in zip(self.world.felt, felt, strict=True):
             rows.copy_(torch.where(by_world(held, rows), kept, rows))
-        stay = self._skip_tensordict(tensordict.select(*self.full_done_spec, *self.full_observation_spec, strict=False))
         return after.apply(lambda new, old: torch.where(rows_of(held.view(*self.batch_size, 1), new), old, new), stay)
 
     def _reset(

@@ -2,7 +2,7 @@
 
 import contextlib
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from typing import Any, cast
 
 import mujoco
@@ -56,14 +56,14 @@ def reads_of(env: Any) -> Iterator[set[str]]:
 
 
 class Noting(dict[str, torch.Tensor]):
-    """Arrays of all worlds, with the entries of memory that were read."""
+    """Arrays of all worlds, with the names of those that were read."""
 
     def __init__(self, arrays: Arrays) -> None:
         super().__init__(arrays)
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> torch.Tensor:
-        self.read.add(name.removeprefix("memory."))
+        self.read.add(name)
         return super().__getitem__(name)
 
 
@@ -95,7 +95,7 @@ class Hooks:
         self.catalog.constants = constants(self._title, own_tables, {*PUBLIC, *memory, *shared}, env.device)
         if not env.with_metrics:
             self.own -= {"metrics"}
-        kept: dict[str, Any] = {"device": env.device}
+        kept: dict[str, Any] = {"device": env.device, "dtype": torch.float32}
         self.commands = {  # those that can be set, in worlds to play with: their values, and in which worlds they are
             entry: (torch.zeros(env.num_envs, *memory[entry].shape, **kept), torch.zeros(env.num_envs, **kept) > 0)
             for entry in (env.command_ranges if env.play else ())
@@ -249,29 +249,47 @@ class Hooks:
                 self.catalog.memory[HISTORY.format(group)] = Entry((count, size), torch.float32)
                 self.history[group], self.groups[group] = count, (count * size,)
 
-    def _carried(self, arrays: "Noting", begun: Mapping[str, torch.Tensor]) -> tuple[str, ...]:
+    def _carried(self, arrays: Noting, begun: Arrays) -> tuple[str, ...]:
         """Returns the entries of memory from which ``begin`` makes entries of memory: a level, or the next level.
 
         One that begins from itself stands for whatever else its next value is made from, such as a distance so far.
         """
-        made = {entry: self._made_from(entry, arrays, begun) for entry in self.catalog.memory if entry in arrays.read}
-        of_themselves = [rows for entry, rows in made.items() if entry in rows]
-        explained = set[str]().union(*of_themselves)
+        read = [entry for entry in self.catalog.memory if f"memory.{entry}" in arrays.read]
+        kept = begun.keys() & self.catalog.memory.keys()
+        if not kept:
+            return ()
+        made = {entry: self._made_from(entry, arrays, kept) for entry in read}
+        # What an entry makes of itself may not show where all others are zero.
+        held = {key: arrays[key] for key in (f"memory.{entry}" for entry in read)}
+        others = {key: _moved(rows, by=3 if rows.is_floating_point() else 1) for key, rows in held.items()}
+        for entry in kept.intersection(read):
+            if entry not in made[entry]:
+                made[entry] |= self._made_from(entry, {**arrays, **others}, kept)
+        explained = set[str]().union(*(rows for entry, rows in made.items() if entry in rows))
         return tuple(entry for entry, rows in made.items() if entry in rows or rows - explained)
 
-    def _made_from(self, entry: str, arrays: Arrays, begun: Mapping[str, torch.Tensor]) -> set[str]:
-        """Returns the entries of memory that ``begin`` makes otherwise where an entry held something else."""
-        key, kept = f"memory.{entry}", begun.keys() & self.catalog.memory.keys()
-        held, found = arrays[key], set[str]()
-        # Of several numbers some may be clamped.
-        for other in [~held] if held.dtype == torch.bool else [held + by for by in (1, 3, 10, 100, -1)]:
+    def _made_from(self, entry: str, arrays: Arrays, kept: Set[str]) -> set[str]:
+        """Returns the entries of memory, of those ``kept``, that ``begin`` makes otherwise from another number."""
+        key = f"memory.{entry}"
+        # Of several numbers some may be clamped. A number may be an index, which on CUDA ends the process if it is
+        # beyond its table, so integers that may be no more than that are changed by one.
+        steps = (1, 3, 10, 100, -1) if entry in kept or arrays[key].is_floating_point() else (1,)
+        try:
+            begun = self._rows_kept(arrays, kept)
+        except Exception:  # nothing can be told
+            return set()
+        for step in steps:
             try:
-                again = self._call("begin", {**arrays, key: other})
+                again = self._rows_kept({**arrays, key: _moved(arrays[key], step)}, kept)
             except Exception:  # it refuses that number, so it reads it
-                return {entry} if entry in kept else kept
-            pairs = {name: (again[name].expand_as(begun[name]), begun[name]) for name in kept}
-            found |= {name for name, pair in pairs.items() if not torch.equal(*(rows.nan_to_num() for rows in pair))}
-        return found
+                return {entry} & kept or {*kept}
+            if found := {name for name in kept if not torch.equal(again[name], begun[name])}:
+                return found
+        return set()
+
+    def _rows_kept(self, arrays: Arrays, kept: Set[str]) -> dict[str, torch.Tensor]:
+        rows = self._rows("begin", arrays, {**self.catalog.memory, **self._pose})
+        return {name: rows[name].nan_to_num() for name in kept}
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
         """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise."""
@@ -415,7 +433,7 @@ class Hooks:
                 values = values.flatten(1)
             a[f"out.{name}"].copy_(values)
         outputs = [a[name] for name in a if name.startswith("out.")]
-        memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind != torch.bool]
+        memory = [a[f"memory.{name}"] for name, (_, kind) in self.catalog.memory.items() if kind.is_floating_point]
         wrong = a["non_finite"] | beyond(a["reward"], a["qpos"], a["qvel"], *memory, *outputs) | self._lost(a)
         a["non_finite"].copy_(wrong)
         for values in (*outputs, a["reward"], a["terms"], *([a["metrics"]] if self.metric_names else [])):
@@ -484,16 +502,14 @@ NO_GROUPS = (*("reward", "done", "terminated", "truncated", "action", "next", "_
 
 
 def beyond(*arrays: torch.Tensor) -> torch.Tensor:
-    """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that.
-
-    The lowest integer is what a kernel gives for an index beyond a tensor of integers.
-    """
-    rows = [values.flatten(1) if values.ndim > 1 else values.unsqueeze(1) for values in arrays]
-    finite = [
-        values.abs() < MAX_VALUE if values.is_floating_point() else values != torch.iinfo(values.dtype).min
-        for values in rows
-    ]
+    """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
+    finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
+
+
+def _moved(held: torch.Tensor, by: int) -> torch.Tensor:
+    """Returns other numbers than an entry of memory holds; of flags the others."""
+    return ~held if held.dtype == torch.bool else held + by
 
 
 def _kind(value: Any) -> str:

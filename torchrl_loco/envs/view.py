@@ -158,6 +158,10 @@ class View:
                 f"s.{name} belongs to a step, and {self._hook}() is also called after a reset: "
                 f"keep what you need of it in memory, by returning it from events()"
             )
+        if name == "ctrl" and self._hook == "control":  # the last ones would outlive their episode
+            raise ValueError(
+                "s.ctrl is what control() returns: keep the last controls in memory, by returning them from update()"
+            )
         if name in OF_THE_LAST_EPISODE:
             self._refuse_in_begin(name)
         self._catalog.arrays.add(name)
@@ -184,7 +188,7 @@ class View:
 
     @property
     def ctrl(self) -> torch.Tensor:
-        """Controls of the step, ``(num_envs, nu)``; not in ``observation`` and ``begin``."""
+        """Controls of the step, ``(num_envs, nu)``; not in ``control``, ``observation`` and ``begin``."""
         return self._array("ctrl")
 
     @property

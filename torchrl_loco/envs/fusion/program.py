@@ -163,7 +163,8 @@ class Program:
             return x
         if dtype not in TYPES:
             raise CannotFuse(f"{{op}} is of {dtype}")
-        return Value(np.asarray(np.frompyfunc(convert, 1, 1)(x.array), dtype=object), dtype, x.world)
+        with np.errstate(invalid="ignore"):  # which NumPy would say of a constant that torch converts meanwhile
+            return Value(np.asarray(np.frompyfunc(convert, 1, 1)(x.array), dtype=object), dtype, x.world)
 
     def source(self, tensor: torch.Tensor, world: int | None) -> Value:
         """Returns a tensor that is read from memory, and whose changes are written there."""

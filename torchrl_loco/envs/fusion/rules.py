@@ -112,7 +112,7 @@ def _pow(p: Program, base: Any, exponent: Any) -> Value:
         return product if exponent > 0 else p.apply("1.0f / {0}", dtype, product)
     if dtype != torch.float32:
         raise CannotFuse("{op} takes integers to a power")
-    if exponent in (0.5, -0.5):  # powf has other zeros and infinities
+    if isinstance(exponent, float) and abs(exponent) == 0.5:  # powf has other zeros and infinities
         return p.apply("sqrtf({0})" if exponent > 0 else "1.0f / sqrtf({0})", dtype, base)
     return p.apply("powf({0}, {1})", dtype, base, exponent)
 
