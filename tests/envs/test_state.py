@@ -73,6 +73,18 @@ def test_restores_the_worlds_of_a_mask_only(shared, kind):
         assert (after[key][::2] == now[key][::2]).all(), key
 
 
+@for_each("wrap", [lambda env: env, lambda env: torchrl_loco.TransformedEnv(env, RewardSum())])
+def test_what_a_reset_leaves_out_need_not_be_passed(wrap):
+    env = wrap(torchrl_loco.make("walker_walk", 2, "cpu", seed=0))
+    seen = env.rollout(3)[:, -1]["next", "observation"]
+    mask = TensorDict({"_reset": torch.tensor([[True], [False]])}, batch_size=[2])
+    after = env.reset(mask.clone())["observation"]
+    assert torch.equal(after[1], seen[1])
+    assert not torch.equal(after[0], seen[0])
+    state = env.get_state().update(mask)
+    assert torch.equal(env.reset(state, set_state=True)["observation"], after)
+
+
 def test_qpos_and_qvel_are_enough(shared):
     env = shared()
     env.rollout(3)

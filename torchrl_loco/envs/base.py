@@ -35,7 +35,7 @@ from torchrl_loco.envs.hooks import Hooks
 from torchrl_loco.envs.monitors import ON_OVERFLOW, warn
 from torchrl_loco.envs.pixels import Pictures, Pixels, Seen
 from torchrl_loco.envs.resets import QuickResets, rows_of
-from torchrl_loco.envs.state import State, by_world, without_state
+from torchrl_loco.envs.state import State, before_reset, by_world
 from torchrl_loco.envs.task import BOUNDED, folder_of, options_of_class, replaced_options
 from torchrl_loco.envs.variation import Variation
 from torchrl_loco.envs.vary import Vary, check_randomize
@@ -407,14 +407,9 @@ class LocoEnv(WorldAccess, QuickResets):
         return result
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Returns what ``reset`` returns: without a state that was passed, which would become stale.
-
-        Worlds that are not reset keep the entries that were passed; TorchRL would pad those that were not with zeros.
-        """
-        passed = without_state(tensordict, self.device)
-        if passed is not None and "_reset" in passed:
-            passed.update(tensordict_reset.exclude(*passed.keys(True, True)))
-        return super()._reset_proc_data(passed, tensordict_reset)
+        """Returns what ``reset`` returns, in worlds that it leaves out what was passed, or what there is."""
+        before = before_reset(tensordict, tensordict_reset, self.device)
+        return super()._reset_proc_data(before, tensordict_reset)
 
     def _set_seed(self, seed: int | None) -> None:
         """Starts the random streams of all worlds again, at their episode 0."""

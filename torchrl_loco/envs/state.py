@@ -67,15 +67,22 @@ class State(TensorDict):
 torch.serialization.add_safe_globals([State])  # a file of tensors: torch.load reads it without weights_only=False
 
 
-def without_state(tensordict: TensorDictBase | None, device: torch.device | None) -> TensorDictBase | None:
-    """Returns a TensorDict itself, or if it has a state, a new one on ``device`` with its other entries.
+def before_reset(
+    tensordict: TensorDictBase | None, after: TensorDictBase, device: torch.device | None
+) -> TensorDictBase | None:
+    """Returns what worlds that a reset leaves out keep: a TensorDict itself, or if it has a state, a new one without.
 
-    Without ``qpos`` and ``qvel`` it has none: an entry ``memory`` may be a recurrent policy's.
+    The state would become stale. Without ``qpos`` and ``qvel`` it has none: an entry ``memory`` may be a recurrent
+    policy's. Entries that were not passed are those of ``after``; TorchRL would pad them with zeros.
     """
-    if tensordict is None or not ("qpos" in tensordict and "qvel" in tensordict):
-        return tensordict
-    kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
-    return TensorDict(kept, batch_size=tensordict.batch_size, device=device)
+    if tensordict is None:
+        return None
+    if "qpos" in tensordict and "qvel" in tensordict:
+        kept = {key: value for key, value in tensordict.items() if key not in State.KEYS}
+        tensordict = TensorDict(kept, batch_size=tensordict.batch_size, device=device)
+    if "_reset" in tensordict:
+        tensordict.update(after.exclude(*tensordict.keys(True, True)))
+    return tensordict
 
 
 def checked_state(

@@ -13,7 +13,7 @@ from torchrl.envs import transforms as t
 
 from torchrl_loco.checks import check_int
 from torchrl_loco.envs.resets import reset_done_worlds, rows_of
-from torchrl_loco.envs.state import without_state
+from torchrl_loco.envs.state import before_reset
 
 
 class ActionRepeat(FrameSkipTransform):
@@ -186,5 +186,6 @@ class TransformedEnv(TorchRLTransformedEnv):
         return reset_done_worlds(self, tensordict)
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Returns what ``reset`` returns, without a state that was passed to it, which would become stale."""
-        return super()._reset_proc_data(without_state(tensordict, self.device), tensordict_reset)
+        """Returns what ``reset`` returns, in worlds that it leaves out what was passed, or what there is."""
+        before = before_reset(tensordict, tensordict_reset, self.device)
+        return super()._reset_proc_data(before, tensordict_reset)
