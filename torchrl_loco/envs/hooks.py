@@ -2,7 +2,7 @@
 
 import contextlib
 import weakref
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 import mujoco
@@ -14,15 +14,13 @@ from torchrl_loco.envs.fixed_order import fixed_order
 from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.rotations import unit_quaternions
+from torchrl_loco.envs.stage import carried
 from torchrl_loco.envs.state import State, by_world
 from torchrl_loco.envs.tables import Entry, constants
 from torchrl_loco.envs.task import Task, declared, draws_by_warp, own_hooks
-from torchrl_loco.envs.view import CONTACT_HISTORY, PUBLIC, Catalog, View, usable
+from torchrl_loco.envs.view import CONTACT_HISTORY, PUBLIC, Arrays, Catalog, View, usable
 from torchrl_loco.sim import models
 from torchrl_loco.sim.overflow import Overflow
-
-Arrays = Mapping[str, torch.Tensor]
-"""The arrays of all worlds by name: physics, ``memory.<name>``, ``out.<group>``, counters and flags."""
 
 PARTS = {
     "control": ("control",),
@@ -53,18 +51,6 @@ def reads_of(env: Any) -> Iterator[set[str]]:
         yield found
     finally:
         object.__setattr__(env, "__class__", cls)
-
-
-class Noting(dict[str, torch.Tensor]):
-    """Arrays of all worlds, with the names of those that were read."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        super().__init__(arrays)
-        self.read: set[str] = set()
-
-    def __getitem__(self, name: str) -> torch.Tensor:
-        self.read.add(name)
-        return super().__getitem__(name)
 
 
 class Hooks:
@@ -212,11 +198,10 @@ class Hooks:
         self.moves = bool(pose.keys() & rows.keys())
         self._remember(arrays, {name: row for name, row in rows.items() if name in memory})
         self._adapted(arrays)
-        rows = self._rows("begin", noting := Noting(arrays), {**memory, **pose})
-        for name, row in rows.items():
+        for name, row in self._begun(arrays).items():
             if not row.isfinite().all():
                 raise ValueError(f"{self._title}.begin returns {name} with numbers that are not finite")
-        self.carried = self._carried(noting, rows)
+        self.carried = carried(self._begun, arrays, memory)
         self.groups = {name: tuple(values.shape[1:]) for name, values in self._groups(arrays).items()}
         self._declare_noise_and_history()
 
@@ -248,48 +233,6 @@ class Hooks:
                 (size,) = self.groups[group]
                 self.catalog.memory[HISTORY.format(group)] = Entry((count, size), torch.float32)
                 self.history[group], self.groups[group] = count, (count * size,)
-
-    def _carried(self, arrays: Noting, begun: Arrays) -> tuple[str, ...]:
-        """Returns the entries of memory from which ``begin`` makes entries of memory: a level, or the next level.
-
-        One that begins from itself stands for whatever else its next value is made from, such as a distance so far.
-        """
-        read = [entry for entry in self.catalog.memory if f"memory.{entry}" in arrays.read]
-        kept = begun.keys() & self.catalog.memory.keys()
-        if not kept:
-            return ()
-        made = {entry: self._made_from(entry, arrays, kept) for entry in read}
-        # What an entry makes of itself may not show where all others are zero.
-        held = {key: arrays[key] for key in (f"memory.{entry}" for entry in read)}
-        others = {key: _moved(rows, by=3 if rows.is_floating_point() else 1) for key, rows in held.items()}
-        for entry in kept.intersection(read):
-            if entry not in made[entry]:
-                made[entry] |= self._made_from(entry, {**arrays, **others}, kept)
-        explained = set[str]().union(*(rows for entry, rows in made.items() if entry in rows))
-        return tuple(entry for entry, rows in made.items() if entry in rows or rows - explained)
-
-    def _made_from(self, entry: str, arrays: Arrays, kept: Set[str]) -> set[str]:
-        """Returns the entries of memory, of those ``kept``, that ``begin`` makes otherwise from another number."""
-        key = f"memory.{entry}"
-        # Of several numbers some may be clamped. A number may be an index, which on CUDA ends the process if it is
-        # beyond its table, so integers that may be no more than that are changed by one.
-        steps = (1, 3, 10, 100, -1) if entry in kept or arrays[key].is_floating_point() else (1,)
-        try:
-            begun = self._rows_kept(arrays, kept)
-        except Exception:  # nothing can be told
-            return set()
-        for step in steps:
-            try:
-                again = self._rows_kept({**arrays, key: _moved(arrays[key], step)}, kept)
-            except Exception:  # it refuses that number, so it reads it
-                return {entry} & kept or {*kept}
-            if found := {name for name in kept if not torch.equal(again[name], begun[name])}:
-                return found
-        return set()
-
-    def _rows_kept(self, arrays: Arrays, kept: Set[str]) -> dict[str, torch.Tensor]:
-        rows = self._rows("begin", arrays, {**self.catalog.memory, **self._pose})
-        return {name: rows[name].nan_to_num() for name in kept}
 
     def _groups(self, arrays: Arrays, steps: int = 0) -> dict[str, torch.Tensor]:
         """Returns the present observation by group, if a hook makes it: its terms joined in their order, with noise."""
@@ -346,6 +289,10 @@ class Hooks:
         if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
             raise TypeError(f"{self._title}.metrics must return numbers of each world by name, got {_kind(values)}")
         return dict(values)
+
+    def _begun(self, arrays: Arrays) -> dict[str, torch.Tensor]:
+        """Returns what episodes begin with, of pose and memory."""
+        return self._rows("begin", arrays, {**self.catalog.memory, **self._pose})
 
     def _adapted(self, arrays: Arrays) -> dict[str, torch.Tensor]:
         """Returns new values of what worlds share, by name; sums over worlds have a fixed order."""
@@ -446,7 +393,7 @@ class Hooks:
         rows: dict[str, torch.Tensor] = {}
         if "begin" in self.own:
             home = {"qpos": self.catalog.home.expand_as(a["qpos"])}
-            rows = {**home, **self._rows("begin", a, {**memory, **self._pose})}
+            rows = {**home, **self._begun(a)}
         zeros = {name: torch.zeros_like(a[f"memory.{name}"]) for name in memory if name not in rows}
         self._remember(a, {**zeros, **rows}, a["mask"])
         self._remember(a, self._commanded(a), a["mask"])
@@ -505,11 +452,6 @@ def beyond(*arrays: torch.Tensor) -> torch.Tensor:
     """Returns in which worlds a number of arrays ``(num_envs, ...)`` is not finite, or as good as that."""
     finite = [(values.flatten(1) if values.ndim > 1 else values.unsqueeze(1)).abs() < MAX_VALUE for values in arrays]
     return ~torch.stack([part.all(-1) for part in finite]).all(0)
-
-
-def _moved(held: torch.Tensor, by: int) -> torch.Tensor:
-    """Returns other numbers than an entry of memory holds; of flags the others."""
-    return ~held if held.dtype == torch.bool else held + by
 
 
 def _kind(value: Any) -> str:

@@ -14,8 +14,8 @@ import warp as wp
 
 import torchrl_loco
 from torchrl_loco.envs.fusion import CannotFuse, ReachedError, fuse, trace
-from torchrl_loco.envs.hooks import Arrays
 from torchrl_loco.envs.precision import own_precision
+from torchrl_loco.envs.view import Arrays
 from torchrl_loco.garbage import no_collection
 from torchrl_loco.sim import Simulation
 

@@ -128,13 +128,17 @@ class Catalog(Elements):
         return torch.tensor(np.array(values), dtype=torch.float32, device=self.device)
 
 
+Arrays = Mapping[str, torch.Tensor]
+"""The arrays of all worlds by name: physics, ``memory.<name>``, ``out.<group>``, counters and flags."""
+
+
 class View:
     """All worlds, as a hook sees them. The first dimension of every tensor is the world; hooks must not write to it.
 
     Names are those of the model; several names, or a regular expression, add a dimension behind the world's.
     """
 
-    def __init__(self, catalog: Catalog, arrays: Mapping[str, torch.Tensor], hook: str, steps: int = 0) -> None:
+    def __init__(self, catalog: Catalog, arrays: Arrays, hook: str, steps: int = 0) -> None:
         self._catalog, self._arrays, self._hook = catalog, arrays, hook  # random numbers depend on the hook's name
         self._steps = steps  # that the worlds have taken beyond those that are counted
         self._stream: torch.Tensor | None = None

@@ -19,14 +19,14 @@ import warp as wp
 
 from torchrl_loco.envs import episode
 from torchrl_loco.envs.body_funcs import check_pair, check_rows, of_package
-from torchrl_loco.envs.hooks import PARTS, Arrays, reads_of
+from torchrl_loco.envs.hooks import PARTS, reads_of
 from torchrl_loco.envs.monitors import Health, Monitor, NanGuard
 from torchrl_loco.envs.part import Part
 from torchrl_loco.envs.pixels import Seen
 from torchrl_loco.envs.precision import own_precision
 from torchrl_loco.envs.scan import Scans
 from torchrl_loco.envs.state import State
-from torchrl_loco.envs.view import CONTACT_HISTORY
+from torchrl_loco.envs.view import CONTACT_HISTORY, Arrays
 from torchrl_loco.sim import (
     EXCLUSIVE,
     Around,
