@@ -130,6 +130,9 @@ def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
     mixed = Motion(as_npz(tmp_path, g1, rows, joint_pos=joints, joint_names=names, body_names=few, **fewer))
     with pytest.raises(ValueError, match=r"lies .* another order"):  # by the names of its bodies
         mixed.on(g1)
+    in_bytes = as_npz(tmp_path, g1, rows, joint_pos=joints, joint_names=names, body_names=few.astype("S"), **fewer)
+    with pytest.raises(ValueError, match=r"lies .* another order"):  # as some writers have them
+        Motion(in_bytes).on(g1)
     unnamed = as_npz(tmp_path, g1, rows, joint_names=names, body_names=names, **fewer)
     assert any("could not be checked" in note for note in Motion(unnamed).on(g1)[1])
     torn = bytearray(path.read_bytes())

@@ -17,6 +17,7 @@ from torchrl_loco import WalkerWalk, cli
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.export import export_policy
 from torchrl_loco.policy import ObservationNorm, Policy
+from torchrl_loco.training.environments import source_of
 from torchrl_loco.verify import Exported, dofs_of_robot, play, verify
 
 onnx = pytest.importorskip("onnx")
@@ -254,8 +255,29 @@ def test_a_policy_that_had_more_when_its_training_ended_does_not_hold(tmp_path):
         Conditions(episodes=2, delay=(2, 2)): "DOES NOT HOLD: return 38.0, at least 72.0 is asked for, 90% of 80.0",
         Conditions(episodes=2, seconds=2.0): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0",
         Conditions(episodes=2, seconds=0.5): "holds: return 20.0, at least 18.0 is asked for, 90% of 20.0 in the",
+        Conditions(episodes=2, max_falls=0.0): "DOES NOT HOLD: return 40.0, at least 72.0 is asked for, 90% of 80.0",
     }.items():
         assert verify(path, conditions, "cpu").lines[-1].startswith(words)
+    report = verify(path, Conditions(episodes=2, max_falls=0.0), "cpu", alone=True)
+    assert report.lines[-1] == "holds: falls in 0.0% of the episodes, 0.0% are allowed; the return is not compared"
+
+
+def test_a_policy_is_not_held_to_what_it_had_before_its_task_was_edited(tmp_path, caplog):
+    task, path = torchrl_loco.registry.task_name(Kept), tmp_path / "kept.onnx"
+    for source, words in (
+        (source_of(task), "DOES NOT HOLD: return 40.0, at least 72.0"),
+        ("other", "holds: return 40"),
+    ):
+        export_policy(constant(task, 1, 6, 1.0, mean=80.0, source_hash=source), path)
+        assert verify(path, Conditions(episodes=2), "cpu").lines[-1].startswith(words)
+        path.unlink()
+    assert "is not as it was in the training" in caplog.text
+
+
+def test_the_return_that_a_task_asks_for_is_that_of_whole_episodes(tmp_path):
+    report = verify(exported(tmp_path / "late.onnx"), Conditions(episodes=6, seconds=0.5), "cpu", alone=True)
+    assert "holds" in report.lines[-1]
+    assert "at least 15.0 is asked for" in report.lines[-1]
 
 
 def test_noise_is_the_tasks_own(tmp_path):
@@ -309,7 +331,8 @@ def test_what_cannot_be_verified(standing, tmp_path, capsys):
     del model.metadata_props[:]
     onnx.save(model, nameless)
     cases = {
-        (path, "--alone"): "held to its return in the training simulator",
+        (path, "--alone"): "held to its return in the training simulator, and no episode of it falls",
+        (path, "--alone", "--max_falls", "0"): "it cannot be played alone",
         (path, "--pushes", "1"): "pushes need a body that floats",
         (path, "--delay", "2", "1"): "delay: the least, 2, must not be greater than the greatest, 1",
         (path, "--task", "cheetah_run"): "the policy has 24 numbers of the observation, cheetah_run has 17",

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import math
 import sys
 import warnings
 
@@ -220,6 +221,11 @@ def test_gymnasium_with_arrays(gymnasium, steps):
             assert env.single_observation_space.contains(last)
             for x in last.values():
                 assert np.array_equal(x, after["observation"][world])
+        terms = info["final_info"]["reward_terms"]
+        assert np.array_equal(info["_final_info"], done)
+        for name, term in after["reward_terms"].items():
+            assert np.array_equal(terms[name][done], term.squeeze(-1)[done])
+            assert np.array_equal(terms[f"_{name}"], done)
 
 
 @pytest.mark.ci
@@ -386,6 +392,8 @@ def test_pixels_are_those_of_the_camera_and_metrics_are_infos(gymnasium):
         np.testing.assert_allclose(info["metrics"]["clock"], 0.025)
     with pytest.raises(ValueError, match="camera"):
         wrappers.GymnasiumVectorEnv(Timed, 2, camera="nowhere", **seen)
+    with pytest.raises(TypeError, match="are of another camera than 'side': pass none"):
+        wrappers.GymnasiumVectorEnv(plain, camera="side")
 
 
 # RSL-RL.
@@ -410,6 +418,20 @@ def test_rsl_rl(rsl_rl, steps):
         assert torch.equal(extras["time_outs"], (after["truncated"] & ~after["terminated"]).squeeze(-1))
         for name, term in after["reward_terms"].items():
             assert extras["log"][f"/reward_terms/{name}"] == term.mean()
+
+
+@pytest.mark.ci
+def test_rsl_rl_logs_the_last_mean_where_no_world_counts(rsl_rl):
+    """Its logger takes the plain mean over steps."""
+
+    class Settles(torchrl_loco.WalkerStand):
+        def metrics(self, s):
+            return {"late": torch.where(s.step % 4 == 2, s.step.float(), math.nan)}
+
+    env = wrappers.RslRlVecEnv(Settles, 2, device="cpu", seed=0, metrics=True)
+    told = [env.step(torch.zeros(2, 6))[-1]["log"]["/metrics/late"].item() for _ in range(8)]
+    assert math.isnan(told[0])
+    assert told[1:] == [2.0, 2.0, 2.0, 2.0, 6.0, 6.0, 6.0]
 
 
 class FallAtTheEnd(torchrl_loco.WalkerStand):

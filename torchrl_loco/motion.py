@@ -159,8 +159,8 @@ class Motion:
         stated = check_float(f"fps of {self.path}", float(rate.ravel()[0]))
         if fps is not None and not math.isclose(fps, stated, rel_tol=1e-3):
             raise ValueError(f"{self.path} has {stated:g} frames per second, not {fps:g}")
-        self._joints = [str(name) for name in np.ravel(tables.get("joint_names", ()))]
-        self._bodies = pos, [str(name) for name in np.ravel(tables.get("body_names", ()))]
+        self._joints = _words(tables.get("joint_names", ()))
+        self._bodies = pos, _words(tables.get("body_names", ()))
         return stated, np.concatenate([pos[:, 0], quat[:, 0], joints], axis=1).astype(float)
 
     def _check(self) -> None:
@@ -329,6 +329,11 @@ def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
     if not found:
         raise ValueError("motion must name at least one motion")
     return found
+
+
+def _words(names: Any) -> list[str]:
+    """Returns names of an array as text: some writers have bytes."""
+    return [name.decode() if isinstance(name, bytes) else str(name) for name in np.ravel(names)]
 
 
 def expand(place: Path | str) -> list[Path]:

@@ -93,9 +93,19 @@ def in_task(info: Mapping[str, Any], trained: str, task: str) -> dict[str, Any]:
     here, there = (name.rpartition(":")[2].partition("~")[0] for name in (task, trained))
     if here == there or (cls := resolve(task)).__qualname__ == there:  # of an id, the class may have been named
         return {**info, "task": task}
-    kept = {name: value for name, value in info.items() if name not in EARNED}
+    kept = without_returns(info)
     options = {name: value for name, value in kept.pop("options", {}).items() if name in cls.options}
     return {**kept, "task": task, **({"options": options} if options else {})}
+
+
+def without_returns(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a policy's info says where its task is not that of its training any more: not what it earned."""
+    return {name: value for name, value in info.items() if name not in EARNED}
+
+
+def with_options(info: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a policy's info says under other options of its task, such as motions: not what it earned."""
+    return {**without_returns(info), "options": {**info.get("options", {}), **options}}
 
 
 class Policy(TensorDictModule):

@@ -6,6 +6,7 @@ Both are the policy's own task, with ``engine="mujoco"`` and as it was trained: 
 import contextlib
 import dataclasses
 import json
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,13 @@ from torchrl_loco.conditions import DEFAULT, PUSH, PUSH_EVERY, Conditions
 from torchrl_loco.config import SimConfig, arguments_of
 from torchrl_loco.envs import LocoEnv
 from torchrl_loco.envs.access import set_stage
-from torchrl_loco.envs.task import folder_of
+from torchrl_loco.envs.task import folder_of, own_hooks
 from torchrl_loco.envs.vary import Vary
-from torchrl_loco.policy import check_terms, in_task
+from torchrl_loco.known_files import place_of
+from torchrl_loco.policy import check_terms, in_task, with_options, without_returns
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
+from torchrl_loco.training.environments import source_of
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)  # in which each case of a task is played once
@@ -64,6 +67,7 @@ class Exported:
                 self.facts[name] = json.loads(word)
         if "task" not in self.facts:
             raise ValueError(f"{path} does not say its task: it must be a file that torchrl-loco export wrote")
+        self.facts["task"] = place_of(self.facts["task"], Path(path).parent)
         if task is not None:
             self.facts["info"] = in_task(self.facts.get("info", {}), self.facts["task"], task)
             self.facts["task"] = task
@@ -113,9 +117,14 @@ def verify(
     check_bool("alone", alone)
     exported = Exported(path, task)
     cls = resolve(exported.facts["task"])
+    info = exported.facts.get("info", {})
     if options is not None and (given := options(exported.facts["task"])):
-        info = exported.facts.get("info", {})
-        exported.facts["info"] = {**info, "options": {**info.get("options", {}), **given}}
+        info = with_options(info, given)
+    if info.get("source_hash", source := source_of(exported.facts["task"])) != source:
+        say = logging.getLogger("torchrl_loco").warning
+        say("%s is not as it was in the training, with whose returns none is compared", exported.facts["task"])
+        info = without_returns(info)
+    exported.facts["info"] = info
     conditions = conditions.of(cls.holds)
     if alone:
         check_alone(cls, conditions)
@@ -269,10 +278,13 @@ def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
     """Checks that C MuJoCo alone can tell whether a policy holds."""
     if conditions.min_return is not None:
         raise ValueError("min_return is a share of the return in the training simulator: it cannot be asked for alone")
-    if conditions.max_falls is None and not {"falls", "return"} & cls.holds.keys():
-        raise ValueError(
-            f"{cls.__name__} is held to its return in the training simulator: to play it alone, ask for max_falls"
-        )
+    if {"falls", "return"} & cls.holds.keys():
+        return
+    held = f"{cls.__name__} is held to its return in the training simulator"
+    if "terminated" not in own_hooks(cls):
+        raise ValueError(f"{held}, and no episode of it falls: it cannot be played alone")
+    if conditions.max_falls is None:
+        raise ValueError(f"{held}: to play it alone, ask for max_falls")
 
 
 def play(exported: Exported, env: LocoEnv, conditions: Conditions, label: str) -> Outcome:
@@ -398,9 +410,10 @@ def _report(
             words = f"{failed} of {len(cases[ENGINES[0]])} fail undisturbed"
             bounds.append((failed <= max_falls * len(cases[ENGINES[0]]), words))
     if (least := cls.holds.get("return")) is not None:
+        least *= steps / config.episode_length  # that of a whole episode
         bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
     kept = conditions.min_return
-    if kept is None and not bounds:
+    if kept is None and not {"falls", "return"} & cls.holds.keys():
         kept = cls.holds.get("kept", 0.9)
     if kept is not None and here is not None:
         trained, where = here["return"], "in the training simulator"
@@ -412,6 +425,7 @@ def _report(
         bounds.append((there["return"] >= least, f"{words}, {kept:.0%} of {trained:.1f} {where}"))
     holds = all(met for met, _ in bounds)
     words = "; ".join(text for met, text in bounds if met == holds)
+    words += "; the return is not compared" if kept is not None and here is None else ""
     task, n, metrics = exported.facts["task"], there["episodes"], outcomes[ENGINES[0]].metrics
     episodes = "1 episode, since all begin alike," if n == 1 < DEFAULT.episodes else f"{n} episodes"
     by_case = {} if cls.perfect else {engine: played.by_case() for engine, played in outcomes.items()}

@@ -10,7 +10,7 @@ from compare import assert_same
 from small_runs import SMALL, networks, trained
 
 from torchrl_loco import cli, training
-from torchrl_loco.policy import Policy, load_policy
+from torchrl_loco.policy import ObservationNorm, Policy, load_policy
 from torchrl_loco.training import RunFolder
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.trainer import NothingToLearnError
@@ -184,3 +184,18 @@ def test_errors_while_training(tmp_path, monkeypatch, capsys):
         said = capsys.readouterr().err
         assert (f"torchrl-loco: {error}" in said) == (ended is SystemExit)
         assert "to continue" not in said  # there is no checkpoint
+
+
+def test_a_policy_of_ones_own_is_evaluated(tmp_path, capsys):
+    """Of no run; what its file must say is told."""
+    network = torch.nn.Sequential(ObservationNorm(24), torch.nn.Linear(24, 6), torch.nn.Tanh())
+    info = {"task": "walker_walk", "protocol": "playground", "action_repeat": 1}
+    Policy(network, info).save(tmp_path / "own.safetensors")
+    Policy(network, {"task": "walker_walk"}).save(tmp_path / "nameless.safetensors")
+    (tmp_path / "own.onnx").write_bytes(b"")
+    assert cli.main(["eval", str(tmp_path / "own.safetensors"), "--device", "cpu"]) == 0
+    assert "over 32 episodes" in capsys.readouterr().out
+    for name, message in (("nameless.safetensors", "lacks protocol and action_repeat"), ("own.onnx", "verify plays")):
+        with pytest.raises(SystemExit):
+            cli.main(["eval", str(tmp_path / name), "--device", "cpu"])
+        assert message in " ".join(capsys.readouterr().err.split())

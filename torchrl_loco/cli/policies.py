@@ -53,7 +53,7 @@ class Which(Motions):
         """
         policy, beside = self._load(run_or_task, device)
         if given := self.given(policy.info["task"]):
-            policy.info["options"] = {**policy.info.get("options", {}), **given}
+            policy.info = torchrl_loco.policy.with_options(policy.info, given)
         return policy, beside
 
     def _load(self, run_or_task: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
@@ -93,7 +93,11 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
             raise ValueError(f"{source} is of a run with {what} of your own, which it does not hold: name {run.policy}")
         return training.watching.last_policy(run, device, source), source
     if not source.is_dir():
+        if source.suffix in (".onnx", ".pt2"):
+            raise ValueError(f"{source} is an exported policy: name what it was made of; verify plays .onnx files")
         policy = torchrl_loco.Policy.load(source, device)
+        if missing := [name for name in ("task", "protocol", "action_repeat") if name not in policy.info]:
+            raise ValueError(f"{source} lacks {' and '.join(missing)} in its info: save the policy with them")
         trained = policy.info["task"]
         policy.info = torchrl_loco.policy.in_task(policy.info, trained, task or place_of(trained, source.parent))
         return policy, source

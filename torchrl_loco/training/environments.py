@@ -214,20 +214,32 @@ def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
         )
 
 
+def source_of(task: str) -> str:
+    """Returns a hash of what a user may edit of a task in files: those of its class and model."""
+    digest = hashlib.sha256()
+    _add_source(digest, task)
+    return digest.hexdigest()
+
+
+def _add_source(digest: Any, task: str) -> None:
+    if ":" not in task:
+        return
+    cls = resolve(task)
+    try:
+        file = inspect.getsourcefile(cls)
+    except (TypeError, OSError):  # of a notebook
+        file = None
+    if file is not None and Path(file).is_file():
+        for each in files_of(cls, Path(file)):
+            digest.update(each.read_bytes())
+    else:
+        digest.update("\n".join(_written(cls)).encode())
+
+
 def content_of(task: str, env: LocoEnv) -> str:
     """Returns a hash of what a user may edit of a task: files of its class and model, and its tables, as of motions."""
     digest = hashlib.sha256()
-    if ":" in task:
-        cls = resolve(task)
-        try:
-            file = inspect.getsourcefile(cls)
-        except (TypeError, OSError):  # of a notebook
-            file = None
-        if file is not None and Path(file).is_file():
-            for each in files_of(cls, Path(file)):
-                digest.update(each.read_bytes())
-        else:
-            digest.update("\n".join(_written(cls)).encode())
+    _add_source(digest, task)
     if isinstance(getattr(type(env), "model", None), mujoco.MjSpec):  # made of files that nobody names
         model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
         mujoco.mj_saveModel(env.mj_model, None, model)

@@ -152,7 +152,7 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
 
     Args:
         policy: a shipped policy, or one that a run has written.
-        episodes: number of episodes; ``None`` takes that of the run.
+        episodes: number of episodes; ``None`` takes that of the run, or a run's default.
         seed: seed of the episodes; ``None`` repeats those of the run's last evaluation.
 
     Returns:
@@ -162,8 +162,9 @@ def evaluate_policy(policy: Policy, episodes: int | None = None, seed: int | Non
         ValueError: an argument is out of range, or the policy was trained behind transforms.
     """
     info = policy.info
-    episodes = check_int("episodes", info["eval_episodes"] if episodes is None else episodes)
-    seed = evaluation_seed(info["seed"], final=True) if seed is None else check_int("seed", seed, SEED)
+    of_run = info.get("eval_episodes", TrainingConfig.eval_episodes)
+    episodes = check_int("episodes", of_run if episodes is None else episodes)
+    seed = evaluation_seed(info.get("seed", 0), final=True) if seed is None else check_int("seed", seed, SEED)
     device = str(next(policy.parameters()).device)
     with settings_for_small_networks():
         env = make_for(policy, episodes, device, seed)

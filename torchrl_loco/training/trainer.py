@@ -30,7 +30,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks
 from torchrl_loco.training.config import check_packages_of
-from torchrl_loco.training.environments import Environments, Given, content_of, unwrapped
+from torchrl_loco.training.environments import Environments, Given, content_of, source_of, unwrapped
 from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 from torchrl_loco.training.loggers import Loggers
@@ -142,7 +142,7 @@ class Trainer:
         self.episodes = Episodes(config.num_envs, config.device, config.action_repeat, length, from_start)
         terms = self.env.observation_spec.get("reward_terms", None)
         self._terms = () if terms is None else tuple(terms.keys())
-        self._content = content_of(run.task, self._base)
+        self._content, self._source = content_of(run.task, self._base), source_of(run.task)
         self._progress_at_start = self._progress()
         self.trials = Trials(config, self.frames_per_iteration, self._begin_trial, self._kept_of_trial, self._restore)
         self.collector = RolloutCollector(self.env, self.algorithm.acting(), frames_per_batch=config.frames_per_batch)
@@ -425,7 +425,7 @@ class Trainer:
         of_env: dict[str, Any] = {"trained_on": self.device_name, "control_timestep": self._base.config.ctrl_dt}
         if stage := self._base.stage_of({"stage": self._base.get_stage()}):
             of_env["stage"] = stage
-        of_env |= self.environments.own
+        of_env |= self.environments.own | ({"source_hash": self._source} if ":" in self.run.task else {})
         terms = self._base.observation_layout.get(self.algorithm.spaces.actor_key)
         if terms and not self.environments.transforms:
             of_env["terms"] = list(terms.items())

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase, FrameSkipTransform
 
 from torchrl_loco.checks import check_choice
 from torchrl_loco.envs import LocoEnv
+from torchrl_loco.envs.pixels import checked_camera
 from torchrl_loco.envs.resets import NESTED
 from torchrl_loco.envs.transforms import named_transforms, unwrap
 from torchrl_loco.registry import make
@@ -98,6 +99,9 @@ class Wrapped:
         if camera is not None and (settings.get("from_pixels") or settings.get("depth")):
             settings["camera"] = camera
         self.env, self._picture = made(env, num_envs, settings), (camera or "side", width, height)
+        pixels = base_of(self.env).pixels
+        if camera is not None and pixels and checked_camera(base_of(self.env).mj_model, camera) != pixels.camera:
+            raise TypeError(f"the pixels of this environment are of another camera than {camera!r}: pass none")
         self._groups = groups_of(self.env)
         if mode is not None or camera is not None:
             base_of(self.env).check_picture(*self._picture)

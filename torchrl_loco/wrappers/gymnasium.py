@@ -132,7 +132,7 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
       device knows which worlds are done. In the other worlds it equals the observation.
 
     With ``reward_terms=True``, ``info["reward_terms"]`` has the terms of the step by name, each ``(num_envs,)``; so has
-    ``info["metrics"]`` with ``metrics=True``.
+    ``info["metrics"]`` with ``metrics=True``. Where there is ``final_obs`` they stand in ``final_info``, too.
 
     Args:
         env: an id, a class, or an environment that is made already, with TorchRL's transforms or without.
@@ -222,11 +222,16 @@ class GymnasiumVectorEnv(VectorEnv, common.Wrapped):
         rewards, terminations, truncations, done = (
             self._convert(after[key].squeeze(-1)) for key in ("reward", "terminated", "truncated", "done")
         )
-        infos = {}
+        infos: dict[str, Any] = {}
+        told = {kind: self._convert(of_kind) for kind, of_kind in common.named_numbers(after).items()}
         if self._torch or done.any():
             last = self._convert(self._seen(after))
             infos = {"final_obs": last if self._torch else common.rows_as_objects(last, done), "_final_obs": done}
-        infos |= {kind: self._convert(of_kind) for kind, of_kind in common.named_numbers(after).items()}
+            infos |= {"final_info": {}, "_final_info": done}
+            for kind, of_kind in told.items():
+                marks = {f"_{name}": done for name in of_kind}
+                infos["final_info"] |= {kind: {**of_kind, **marks}, f"_{kind}": done}
+        infos |= told
         return self._convert(self._seen(self._td)), rewards, terminations, truncations, infos
 
     def _convert(self, data: Any) -> Any:

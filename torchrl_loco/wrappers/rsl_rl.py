@@ -23,7 +23,8 @@ class RslRlVecEnv(VecEnv):
     - ``time_outs``, bool ``(num_envs,)``: the worlds that were truncated and not terminated;
     - ``final_observations``: in the form of the observations, the true last ones in worlds that are done, and the
       same as the observations in the others;
-    - ``log``, with ``reward_terms=True`` or ``metrics=True``: the mean of each over the worlds, which RSL-RL logs.
+    - ``log``, with ``reward_terms=True`` or ``metrics=True``: the mean of each over the worlds that count, which RSL-RL
+      logs; where none counts in a step, that of the last step, as NaN would be the mean of all.
 
     Arguments and errors are those of :class:`.GymnasiumVectorEnv`, but for what it says of arrays and pictures.
 
@@ -45,6 +46,7 @@ class RslRlVecEnv(VecEnv):
         if len({*self._names.values()}) < len(self._names):
             raise ValueError("the group 'observation' is called 'policy' in RSL-RL: no other may have that name")
         self._td = self.env.reset()
+        self._log: dict[str, torch.Tensor] = {}
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
@@ -77,8 +79,11 @@ class RslRlVecEnv(VecEnv):
         after, self._td = step_worlds(self.env, self._td, actions)
         time_outs = after["truncated"] & ~after["terminated"]
         extras = {"time_outs": time_outs.squeeze(-1), "final_observations": self._observations(after)}
-        if told := named_numbers(after):
-            extras["log"] = {f"/{kind}/{k}": v.nanmean() for kind, values in told.items() for k, v in values.items()}
+        told = named_numbers(after)
+        for name, mean in {f"/{kind}/{k}": v.nanmean() for kind, each in told.items() for k, v in each.items()}.items():
+            self._log[name] = mean if name not in self._log else torch.where(mean.isnan(), self._log[name], mean)
+        if told:
+            extras["log"] = dict(self._log)
         return self.get_observations(), after["reward"].squeeze(-1), after["done"].squeeze(-1), extras
 
     def close(self) -> None:
