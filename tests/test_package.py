@@ -18,7 +18,7 @@ LAYERS = [  # a module imports from its own layer or from those before it
     {"envs", "viewer"},
     {"tasks"},
     {"registry", "collector"},
-    {"encoder", "policy", "nan_dump", "doctor", "wrappers"},
+    {"encoder", "policy", "nan_dump", "doctor", "source", "wrappers"},
     {"export", "verify"},
     {"training"},
     {"cli", "__main__"},

@@ -17,7 +17,7 @@ from torchrl_loco import WalkerWalk, cli
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.export import export_policy
 from torchrl_loco.policy import ObservationNorm, Policy
-from torchrl_loco.training.environments import source_of
+from torchrl_loco.source import source_of
 from torchrl_loco.verify import Exported, dofs_of_robot, play, verify
 
 onnx = pytest.importorskip("onnx")

@@ -27,7 +27,7 @@ from torchrl_loco.known_files import place_of
 from torchrl_loco.policy import check_terms, in_task, with_options, without_returns
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
-from torchrl_loco.training.environments import source_of
+from torchrl_loco.source import source_of
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)  # in which each case of a task is played once

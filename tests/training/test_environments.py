@@ -18,8 +18,8 @@ from torchrl.envs import (
 )
 
 import torchrl_loco
-from torchrl_loco import LocoEnv, WalkerWalk
-from torchrl_loco.training import PPOConfig, Spaces, environments, preset
+from torchrl_loco import LocoEnv, WalkerWalk, source
+from torchrl_loco.training import PPOConfig, Spaces, preset
 from torchrl_loco.training.environments import ActionRepeat, Environments
 
 
@@ -198,7 +198,7 @@ def test_evaluations_return_what_an_environment_returns_that_was_handed_in():
 
 
 def test_evaluations_that_read_other_attributes_are_told_of_and_edits_of_a_notebook_noticed(caplog, monkeypatch):
-    monkeypatch.setattr(environments.inspect, "getsourcefile", lambda cls: None)  # as of a cell
+    monkeypatch.setattr(source.inspect, "getsourcefile", lambda cls: None)  # as of a cell
 
     def made(factor):
         return type(
@@ -213,7 +213,7 @@ def test_evaluations_that_read_other_attributes_are_told_of_and_edits_of_a_noteb
     Environments(config, env).evaluation(2, seed=0)
     assert "hooks read gain, which is 5.0 in the environment that trains and 1.0 in its evaluations" in caplog.text
     names = [torchrl_loco.registry.task_name(made(1.0)) for _ in range(2)]
-    first, second = (environments.content_of(name, env) for name in names)
+    first, second = (source.content_of(name, env) for name in names)
     assert first == second
     other = type("Gains", (torchrl_loco.WalkerStand,), {"gain": 1.0, "reward": lambda self, s: 2.0 * s.time})
-    assert environments.content_of(torchrl_loco.registry.task_name(other), env) != first
+    assert source.content_of(torchrl_loco.registry.task_name(other), env) != first

@@ -22,10 +22,10 @@ from torchrl.envs import ObservationNorm, StepCounter, VecNormV2
 import torchrl_loco
 from torchrl_loco import Vary, cli, known_files, registry
 from torchrl_loco.policy import Policy
+from torchrl_loco.source import content_of
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import PPOConfig
-from torchrl_loco.training.environments import content_of
 from torchrl_loco.training.start import _warn_of_what_is_not_kept
 from torchrl_loco.training.watching import last_policy
 

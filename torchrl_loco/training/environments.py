@@ -2,18 +2,14 @@
 
 import copy
 import dataclasses
-import hashlib
 import inspect
 import logging
 import os
 import shlex
-import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
-import numpy as np
 import torch
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform
 
@@ -28,7 +24,7 @@ from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import TrainingConfig, is_runner
-from torchrl_loco.training.run_folder import RunFolder, files_of
+from torchrl_loco.training.run_folder import RunFolder
 
 KEPT = ("play", "reward_terms", "observation_terms", "noise_scale", "compile_hooks", "on_overflow")
 """Arguments of an environment that was handed in which its evaluations keep, besides those of physics and pixels."""
@@ -212,60 +208,6 @@ def _refuse_further_arguments(cls: type[LocoEnv]) -> None:
             f"{cls.__name__} takes {', '.join(own)}, which evaluations in worlds of their own do not know: make a "
             "subclass with these values as attributes, and pass that"
         )
-
-
-def source_of(task: str) -> str:
-    """Returns a hash of what a user may edit of a task in files: those of its class and model."""
-    digest = hashlib.sha256()
-    _add_source(digest, task)
-    return digest.hexdigest()
-
-
-def _add_source(digest: Any, task: str) -> None:
-    if ":" not in task:
-        return
-    cls = resolve(task)
-    try:
-        file = inspect.getsourcefile(cls)
-    except (TypeError, OSError):  # of a notebook
-        file = None
-    if file is not None and Path(file).is_file():
-        for each in files_of(cls, Path(file)):
-            digest.update(each.read_bytes())
-    else:
-        digest.update("\n".join(_written(cls)).encode())
-
-
-def content_of(task: str, env: LocoEnv) -> str:
-    """Returns a hash of what a user may edit of a task: files of its class and model, and its tables, as of motions."""
-    digest = hashlib.sha256()
-    _add_source(digest, task)
-    if isinstance(getattr(type(env), "model", None), mujoco.MjSpec):  # made of files that nobody names
-        model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
-        mujoco.mj_saveModel(env.mj_model, None, model)
-        digest.update(model.data)
-    assert env.hooks is not None
-    for table in env.hooks.catalog.constants.values():
-        digest.update(table.cpu().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _written(cls: type) -> Iterator[str]:
-    """Yields what a class and those above say that are in no file: names, numbers, texts and the code of functions."""
-    for base in cls.__mro__:
-        if base is LocoEnv:
-            return
-        for name, value in sorted(vars(base).items()):
-            if isinstance(value, types.FunctionType):
-                yield f"{name} {_steps(value.__code__)}"
-            elif isinstance(value, bool | int | float | str | tuple | list | dict) and not name.startswith("__"):
-                yield f"{name} {value!r}"
-
-
-def _steps(code: types.CodeType) -> str:
-    """Returns what a function does, wherever it is written."""
-    constants = [_steps(each) if isinstance(each, types.CodeType) else repr(each) for each in code.co_consts]
-    return f"{code.co_code.hex()} {code.co_names} {constants}"
 
 
 def _warn_of_other_attributes(given: LocoEnv, own: LocoEnv) -> None:

@@ -18,10 +18,9 @@ import torch
 
 from torchrl_loco import known_files, storage
 from torchrl_loco.checks import check_device, check_run, number_of
-from torchrl_loco.envs.task import folder_of
 from torchrl_loco.policy import Policy, in_task
 from torchrl_loco.registry import resolve
-from torchrl_loco.sim import models
+from torchrl_loco.source import files_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.config import TrainingConfig, check_packages_of, config_from_json
 
@@ -65,11 +64,6 @@ def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, An
     table.writeheader()
     table.writerows(rows)
     storage.replace_file(path, text.getvalue().encode())
-
-
-def files_of(cls: Any, path: Path) -> list[Path]:
-    """Returns the file of a task's class, the modules beside it that it imports, and the files of its model."""
-    return [*known_files.with_imports(path), *models.files(cls.model, folder_of(cls))]
 
 
 class RunFolder:

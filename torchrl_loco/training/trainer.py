@@ -26,11 +26,12 @@ from torchrl_loco.envs.imagined import STATE
 from torchrl_loco.envs.transforms import load_transforms, state_of_transforms
 from torchrl_loco.policy import Policy
 from torchrl_loco.sim.simulation import check_memory
+from torchrl_loco.source import content_of, source_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
 from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks
 from torchrl_loco.training.config import check_packages_of
-from torchrl_loco.training.environments import Environments, Given, content_of, source_of, unwrapped
+from torchrl_loco.training.environments import Environments, Given, unwrapped
 from torchrl_loco.training.episodes import Episodes
 from torchrl_loco.training.evaluation import Evaluator, describe, evaluation_seed, record, shipped_return, summarize
 from torchrl_loco.training.loggers import Loggers
