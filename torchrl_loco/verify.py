@@ -122,7 +122,7 @@ def verify(
         info = with_options(info, given)
     if info.get("source_hash", source := source_of(exported.facts["task"])) != source:
         say = logging.getLogger("torchrl_loco").warning
-        say("%s is not as it was in the training, with whose returns none is compared", exported.facts["task"])
+        say("%s was edited since the training, whose return is not compared", exported.facts["task"])
         info = without_returns(info)
     exported.facts["info"] = info
     conditions = conditions.of(cls.holds)
