@@ -212,6 +212,7 @@ def test_files_folders_globs_and_motions(tmp_path, g1, rows):
         ("b", 50.0),
     ]  # an npz says its rate
     assert [motion.name for motion in motions.read(f"{tmp_path}/**/*.csv", 25.0)] == ["a", "a", "b"]
+    assert motions.expand(f"{tmp_path}*") == motions.expand(tmp_path)  # a glob finds folders, too
     assert motions.read([found[0], tmp_path / "a.csv"], 25.0)[0] is found[0]
     for nothing in (tmp_path / "none", f"{tmp_path}/*.txt"):
         with pytest.raises(FileNotFoundError, match="there is no motion"):

@@ -337,13 +337,15 @@ def _words(names: Any) -> list[str]:
 
 
 def expand(place: Path | str) -> list[Path]:
-    """Returns the files of a path, a folder or a glob, in the order of their names."""
+    """Returns the files of a path, a folder, or a glob of both, in the order of their names."""
     path = Path(place).expanduser()
     if path.is_file():
         return [path]
-    found = path.rglob("*") if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
+    places = [path] if path.is_dir() else list(map(Path, glob.glob(str(path), recursive=True)))
+    folders = [each for each in places if each.is_dir()]
+    found = {*places}.union(*(folder.rglob("*") for folder in folders))
     files = sorted(file for file in found if file.suffix.lower() in SUFFIXES)
-    if path.is_dir():
+    if folders:
         files = list({file.with_suffix(""): file for file in files}.values())  # of one name, the npz comes last
     if not files:
         raise FileNotFoundError(
