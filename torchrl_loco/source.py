@@ -24,14 +24,13 @@ def files_of(cls: Any, path: Path) -> list[Path]:
 
 def source_of(task: str) -> str:
     """Returns a hash of what a user may edit of a task in files: those of its class and model."""
+    return _digest(task).hexdigest()
+
+
+def _digest(task: str) -> Any:
     digest = hashlib.sha256()
-    _add_source(digest, task)
-    return digest.hexdigest()
-
-
-def _add_source(digest: Any, task: str) -> None:
     if ":" not in task:  # it is of a package
-        return
+        return digest
     cls = resolve(task)
     try:
         file = inspect.getsourcefile(cls)
@@ -42,12 +41,12 @@ def _add_source(digest: Any, task: str) -> None:
             digest.update(each.read_bytes())
     else:
         digest.update("\n".join(_written(cls)).encode())
+    return digest
 
 
 def content_of(task: str, env: LocoEnv) -> str:
     """Returns a hash of what a user may edit of a task: files of its class and model, and its tables, as of motions."""
-    digest = hashlib.sha256()
-    _add_source(digest, task)
+    digest = _digest(task)
     if isinstance(getattr(type(env), "model", None), mujoco.MjSpec):  # made of files that nobody names
         model = np.empty(mujoco.mj_sizeModel(env.mj_model), dtype=np.uint8)
         mujoco.mj_saveModel(env.mj_model, None, model)

@@ -120,7 +120,8 @@ def verify(
     info = exported.facts.get("info", {})
     if options is not None and (given := options(exported.facts["task"])):
         info = with_options(info, given)
-    if info.get("source_hash", source := source_of(exported.facts["task"])) != source:
+    source = source_of(exported.facts["task"])
+    if info.get("source_hash", source) != source:
         say = logging.getLogger("torchrl_loco").warning
         say("%s was edited since the training, whose return is not compared", exported.facts["task"])
         info = without_returns(info)
@@ -274,11 +275,16 @@ class Outcome:
         }
 
 
+def keeps_a_share(cls: type[LocoEnv]) -> bool:
+    """Returns whether a policy must keep a share of its return, as the task asks for neither falls nor a return."""
+    return not {"falls", "return"} & cls.holds.keys()
+
+
 def check_alone(cls: type[LocoEnv], conditions: Conditions) -> None:
     """Checks that C MuJoCo alone can tell whether a policy holds."""
     if conditions.min_return is not None:
         raise ValueError("min_return is a share of the return in the training simulator: it cannot be asked for alone")
-    if {"falls", "return"} & cls.holds.keys():
+    if not keeps_a_share(cls):
         return
     held = f"{cls.__name__} is held to its return in the training simulator"
     if "terminated" not in own_hooks(cls):
@@ -413,7 +419,7 @@ def _report(
         least *= steps / config.episode_length  # that of a whole episode
         bounds.append((there["return"] >= least, f"return {there['return']:.1f}, at least {least:.1f} is asked for"))
     kept = conditions.min_return
-    if kept is None and not {"falls", "return"} & cls.holds.keys():
+    if kept is None and keeps_a_share(cls):
         kept = cls.holds.get("kept", 0.9)
     if kept is not None and here is not None:
         trained, where = here["return"], "in the training simulator"

@@ -231,15 +231,14 @@ def returns() -> str:
         under = protocol if (task, protocol) in PUBLISHED else "dm_control"
         published, by = PUBLISHED[task, under]
         there = suite[task] if protocol == "dm_control" else None
-        alone = _alone(task, protocol)
-        whole = alone["task"] == task and float(alone["frames"]) == _mean(seeds, "frames")
+        alone, is_whole = _alone(task, protocol)
         rows.append(
             (
                 task,
                 protocol,
                 f"{_mean(seeds, 'mean'):.1f}",
                 ", ".join(f"{float(row['mean']):.0f}" for row in seeds),
-                f"{float(alone['mean']):.0f}" if whole else "",
+                f"{float(alone['mean']):.0f}" if is_whole else "",
                 f"{_mean(seeds, 'frames') / 1e6:.0f}",
                 time_of_training(task, protocol),
                 f"{there['mean']:.1f} +- {there['std']:.1f}" if there else "",
@@ -294,16 +293,15 @@ def seeds_of(task: str, protocol: str) -> list[dict[str, str]]:
 
 def time_of_training(task: str, protocol: str) -> str:
     """Returns the seconds that a run takes on a GPU of its own, with ~ where another run tells its speed."""
-    frames, alone = _mean(seeds_of(task, protocol), "frames"), _alone(task, protocol)
-    seconds = float(alone["seconds"]) * frames / float(alone["frames"])
-    whole = alone["task"] == task and float(alone["frames"]) == frames
-    return f"{'' if whole else '~'}{seconds:.0f}"
+    alone, is_whole = _alone(task, protocol)
+    seconds = float(alone["seconds"]) * _mean(seeds_of(task, protocol), "frames") / float(alone["frames"])
+    return f"{'' if is_whole else '~'}{seconds:.0f}"
 
 
-def _alone(task: str, protocol: str) -> dict[str, str]:
-    """Returns the run that had its GPU to itself, of a task or of the one like it."""
+def _alone(task: str, protocol: str) -> tuple[dict[str, str], bool]:
+    """Returns the run that had its GPU to itself, and whether it is of the task, not one like it, and as long."""
     (row,) = _results(ALONE_NOW, LIKE.get(task, task), protocol)
-    return row
+    return row, row["task"] == task and float(row["frames"]) == _mean(seeds_of(task, protocol), "frames")
 
 
 def _results(folder: str, task: str, protocol: str) -> list[dict[str, str]]:

@@ -93,7 +93,7 @@ def _policy_at(source: Path, device: str | None, task: str | None) -> tuple["tor
             raise ValueError(f"{source} is of a run with {what} of your own, which it does not hold: name {run.policy}")
         return training.watching.last_policy(run, device, source), source
     if not source.is_dir():
-        if source.suffix in (".onnx", ".pt2"):
+        if source.suffix in torchrl_loco.export.SUFFIXES.values():
             raise ValueError(f"{source} is an exported policy: name what it was made of; verify plays .onnx files")
         policy = torchrl_loco.Policy.load(source, device)
         if missing := [name for name in ("task", "protocol", "action_repeat") if name not in policy.info]:

@@ -1,5 +1,6 @@
 """Which entries of memory tell how far a curriculum has come: what the next episode is made from."""
 
+import contextlib
 from collections.abc import Callable, Collection
 
 import torch
@@ -34,31 +35,29 @@ def carried(begin: Callable[[Arrays], Arrays], arrays: Arrays, memory: Collectio
     read = [name for name in memory if f"memory.{name}" in noting.read]
     if not kept:
         return ()
-    made = {name: _made_from(name, begin, arrays, kept) for name in read}
+    made = {name: _made_from(name, begin, arrays, rows, kept) for name in read}
     # What an entry makes of itself may not show where all others are zero.
     held = {key: arrays[key] for key in (f"memory.{name}" for name in read)}
-    others = {key: _moved(rows, by=3 if rows.is_floating_point() else 1) for key, rows in held.items()}
-    for name in read:
-        if name in kept - made[name]:
-            made[name] |= _made_from(name, begin, {**arrays, **others}, kept)
+    others = {key: _moved(values, by=3 if values.is_floating_point() else 1) for key, values in held.items()}
+    with contextlib.suppress(Exception):  # begin refuses these numbers: nothing more can be told
+        rows = begin({**arrays, **others})
+        for name in read:
+            if name in kept - made[name]:
+                made[name] |= _made_from(name, begin, {**arrays, **others}, rows, kept)
     explained = set[str]().union(*(entries for name, entries in made.items() if name in entries))
     return tuple(name for name, entries in made.items() if name in entries or entries - explained)
 
 
-def _made_from(name: str, begin: Callable[[Arrays], Arrays], arrays: Arrays, kept: set[str]) -> set[str]:
-    """Returns the entries of memory, of those ``kept``, that ``begin`` makes otherwise of another number of one."""
+def _made_from(name: str, begin: Callable[[Arrays], Arrays], arrays: Arrays, rows: Arrays, kept: set[str]) -> set[str]:
+    """Returns which of the entries ``kept`` differ from ``rows`` where an entry of memory holds another number."""
     key = f"memory.{name}"
     # Of several numbers some may be clamped. A number may be an index, which on CUDA ends the process if it is beyond
     # its table, so integers that may be no more than that are changed by one.
     steps = (1, 3, 10, 100, -1) if name in kept or arrays[key].is_floating_point() else (1,)
-    try:
-        before = begin(arrays)
-    except Exception:  # nothing can be told
-        return set()
     for step in steps:
         try:
             after = begin({**arrays, key: _moved(arrays[key], step)})
-            pairs = {entry: (after[entry].nan_to_num(), before[entry].nan_to_num()) for entry in kept}
+            pairs = {entry: (after[entry].nan_to_num(), rows[entry].nan_to_num()) for entry in kept}
         except Exception:  # it refuses that number, so it reads it
             return {name} & kept or kept
         if found := {entry for entry, pair in pairs.items() if not torch.equal(*pair)}:

@@ -80,8 +80,10 @@ class RslRlVecEnv(VecEnv):
         time_outs = after["truncated"] & ~after["terminated"]
         extras = {"time_outs": time_outs.squeeze(-1), "final_observations": self._observations(after)}
         told = named_numbers(after)
-        for name, mean in {f"/{kind}/{k}": v.nanmean() for kind, each in told.items() for k, v in each.items()}.items():
-            self._log[name] = mean if name not in self._log else torch.where(mean.isnan(), self._log[name], mean)
+        for kind, values in told.items():
+            for name, value in values.items():
+                key, mean = f"/{kind}/{name}", value.nanmean()
+                self._log[key] = torch.where(mean.isnan(), self._log.get(key, mean), mean)
         if told:
             extras["log"] = dict(self._log)
         return self.get_observations(), after["reward"].squeeze(-1), after["done"].squeeze(-1), extras
