@@ -74,18 +74,19 @@ TRAINED = {
 SEEDS = ("2026-11-23/h200-presets/campaign", "2026-11-23/h200-seeds/campaign")
 FIRST, ALONE, LAST = "2026-11-23/h200/campaign", "2026-11-23/h200-alone/campaign", "2026-11-24/h200-alone/campaign"
 FURTHER, RUN = "2026-11-22/h200-runners/campaign", "2026-11-24/h100/walker-run"
+BY_KERNELS = "2026-11-30/h200-seeds"
 RUNS: dict[tuple[str, str], Sequence[str]] = {
     ("walker_stand", "playground"): SEEDS,
     ("walker_walk", "playground"): SEEDS,
     ("walker_run", "playground"): [RUN],
     ("humanoid_stand", "playground"): SEEDS,
     ("humanoid_walk", "playground"): SEEDS,
-    ("humanoid_run", "playground"): [FIRST, SEEDS[1]],
+    ("humanoid_run", "playground"): [BY_KERNELS],
     ("cheetah_run", "playground"): [FURTHER],
     ("hopper_stand", "playground"): [FURTHER],
     ("hopper_hop", "playground"): [FURTHER],
     ("quadruped_walk", "playground"): [FURTHER],
-    ("quadruped_run", "playground"): [FURTHER],
+    ("quadruped_run", "playground"): [BY_KERNELS],
     ("walker_stand", "dm_control"): SEEDS,
     ("walker_walk", "dm_control"): SEEDS,
     ("walker_run", "dm_control"): [RUN],
