@@ -189,6 +189,8 @@ def test_a_camera_shows_what_is_there_now():
     env.rollout(2)
     env.camera("back", 24, 16)
     assert torch.equal(seen["rgb"], kept)
+    assert "observation" not in td
+    assert {"observation", "depth"} <= set(loco.make("walker_walk", 2, "cpu", 0, depth=5.0, size=(8, 6)).reset().keys())
     single = loco.make("walker_walk", None, "cpu", 0)
     single.reset()
     assert single.camera(width=8, height=6)["rgb"].shape == (6, 8, 3)

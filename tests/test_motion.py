@@ -84,6 +84,11 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         (lambda: written(tmp_path, rows, header="x,y,z,w_quat,x_quat,y_quat,z_quat"), "in the order .* x, y, z, w"),
         (lambda: written(tmp_path, rows, header="x,y,z,qz,qy,qx,qw"), "in the order .* x, y, z, w"),
         (lambda: written(tmp_path, rows, header="pos.z,pos.x,pos.y,qx,qy,qz,qw"), "in the order x, y, z"),
+        (lambda: written(tmp_path, np.vstack([np.arange(36), rows])), "numbers of its columns in line 1"),
+        (
+            lambda: written(tmp_path, np.column_stack([rows[:, 0], rows])),
+            "of 37 columns the 4th to the 7th",
+        ),
         (lambda: written(tmp_path, rows[:1]), "1 frames"),
         (lambda: written(tmp_path, rows[:0]), "none"),
         (lambda: written(tmp_path, rows[:, :6]), "rows of 6"),
@@ -96,6 +101,9 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
     (tmp_path / "ragged.csv").write_text("1,2,3,0,0,0,1,4\n1,2,3,0,0,0,1\n")
     with pytest.raises(ValueError, match="rows of 7 to 8 numbers"):
         Motion(tmp_path / "ragged.csv", fps=50.0)
+    (tmp_path / "spaces.csv").write_text("1 2 3 0 0 0 1 4\n" * 2)
+    with pytest.raises(ValueError, match="column 1, without a comma"):
+        Motion(tmp_path / "spaces.csv", fps=50.0)
     for row in ("1,2,3,0,0,0,1,what", "#1,2,3,0,0,0,1,4"):
         (tmp_path / "words.csv").write_text(f"1,2,3,0,0,0,1,4\n{row}\n1,2,3,0,0,0,1,4\n")
         with pytest.raises(ValueError, match=r"in line 2, column [18]"):
@@ -115,6 +123,8 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         Motion(tmp_path / "clip.pkl")
     with pytest.raises(FileNotFoundError):
         Motion(tmp_path / "none.csv", fps=50.0)
+    with pytest.raises(AttributeError):  # it is read from its file again
+        Motion(PUNCHES, fps=OWN_RATE).qpos = np.zeros((5, 36))
 
 
 def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
@@ -133,6 +143,11 @@ def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):
     in_bytes = as_npz(tmp_path, g1, rows, joint_pos=joints, joint_names=names, body_names=few.astype("S"), **fewer)
     with pytest.raises(ValueError, match=r"lies .* another order"):  # as some writers have them
         Motion(in_bytes).on(g1)
+    order, named = [1, 0, *range(2, 30)], tables_of(as_npz(tmp_path, g1, rows))
+    turned = {key: named[key][:, order] for key in fewer}
+    bodies = np.array([g1.body(1 + i).name for i in order])
+    with pytest.raises(ValueError, match="the first body must be the base, 'pelvis'"):
+        Motion(as_npz(tmp_path, g1, rows, body_names=bodies, **turned)).on(g1)
     unnamed = as_npz(tmp_path, g1, rows, joint_names=names, body_names=names, **fewer)
     assert any("could not be checked" in note for note in Motion(unnamed).on(g1)[1])
     torn = bytearray(path.read_bytes())

@@ -228,6 +228,8 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot(tmp_path)
     mixed = type("Mixed", (Wide, Hills), {})
     assert mixed.model.hfields[0].size[0] == max(Wide.ground.half) != max(Hills.ground.half)
     assert Long.config.solids_on_terrain == "spheres"
+    with pytest.raises(TypeError, match=r"ground of Groundless must be a .*Terrain, got 'stairs'"):
+        type("Groundless", (loco.Go1Rough,), {"ground": "stairs"})
     with pytest.raises(TypeError, match="Footless must set feet"):
         type("Footless", (rough.Rough,), {"model": loco.Go1Velocity.model})
     assert Short.config.episode_length == 77

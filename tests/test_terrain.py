@@ -202,6 +202,8 @@ def test_a_kind_of_ones_own_may_be_as_low_as_one_says():
         ({"a": lambda *args: terrain.Patch(boxes=np.ones((2, 5)))}, {}, r"rows of 6, .*, got \(2, 5\)"),
         ({"a": terrain.stairs}, {"size": 4.0}, r"stairs, and their platform \(5.6 m\) must fit into a patch of 4 m"),
         ({"a": functools.partial(terrain.stairs, width=0.0)}, {}, "width of stairs must lie in"),
+        ({"a": functools.partial(terrain.rough, step=0.0)}, {}, "step must lie in"),
+        ({"a": functools.partial(terrain.rough, height=(-0.1, 0.1))}, {}, "height of rough must lie in"),
         ({"a": functools.partial(terrain.slope, platform=9.0)}, {}, "platform of a slope"),
         ({"a": functools.partial(terrain.obstacles, platform=9.0)}, {}, "free middle between obstacles"),
         ({"a": terrain.stepping_stones}, {"size": 4.0}, "a stone, gaps and the edge"),
@@ -218,6 +220,11 @@ def test_a_kind_of_ones_own_may_be_as_low_as_one_says():
 def test_bad_input(kinds, settings, message):
     with pytest.raises((ValueError, TypeError), match=message):
         terrain.Terrain(kinds, **settings)
+
+
+def test_a_pit_may_be_as_wide_as_its_patch():
+    pit = terrain.Terrain({"a": terrain.pit}, rows=1, columns=1, size=3.0)
+    assert pit.height(np.zeros((1, 2))) == pytest.approx(-0.5)
 
 
 def test_there_must_be_a_level_floor():

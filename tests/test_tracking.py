@@ -235,6 +235,8 @@ def test_a_robot_that_does_not_fit_is_refused(short):
     spec.delete(spec.actuators[0])
     unfit = [
         ({"anchor": "left_knee"}, "must hold base, anchor and ends, but not left_knee"),
+        ({"bodies": (*H1Tracking.bodies, "pelvis")}, "bodies of Other has 'pelvis' twice"),
+        ({"bodies": (*H1Tracking.bodies, "left_ankl")}, "it has no body 'left_ankl', did you mean"),
         ({"bodies": H1Tracking.bodies[::-1]}, "the first of bodies of Other must be the base"),
         ({"model": spec, "memory": tracking.memory(18)}, "an actuator for each joint, in their order: left_hip_yaw"),
         ({"memory": tracking.memory(18)}, "memory is that of 18 joints, but it has 19 actuators"),
@@ -270,6 +272,9 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
     with pytest.raises(ValueError, match="unknown argument 'motions', did you mean 'motion'"):
         loco.make("h1_tracking", 1, "cpu", 0, motions=short)
     assert loco.make("h1_tracking", 1, "cpu", 0, future=3, **PLAIN).future == (3,)
+    assert loco.make("h1_tracking", 1, "cpu", 0, future=range(1, 3), **PLAIN).future == (1, 2)
+    other = {**H1Tracking.options, "motion": (str(short), "Short ones."), "fps": (25.0, "Theirs.")}
+    assert list(type("Others", (H1Tracking,), {"options": other})(1, "cpu", 0, **PLAIN).cases()) == ["a", "b"]
     sees = type("Sees", (loco.H1Tracking,), {"future": (1, 2)})  # as a class's attribute
     assert (sees(1, "cpu", 0, **PLAIN).future, sees(1, "cpu", 0, future=(), **PLAIN).future) == ((1, 2), ())
     for future in ((-1,), (0,), ("a",), 1.5):

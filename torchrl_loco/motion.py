@@ -51,9 +51,7 @@ class Motion:
         weight: how often it is practised, by the time it takes, relative to others.
 
     Attributes:
-        name: the file's, without its suffix.
         fps: frames per second.
-        qpos: the poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -71,7 +69,7 @@ class Motion:
     ) -> None:
         self.path = Path(path).expanduser()
         self.clip, self.ground = check_bool("clip", clip), check_bool("ground", ground)
-        self.name, self.weight = self.path.stem, check_float("weight", weight)
+        self.weight = check_float("weight", weight)
         if not self.path.is_file():
             raise FileNotFoundError(f"there is no file {self.path}")
         fps = None if not fps else check_float("fps", fps)
@@ -84,12 +82,25 @@ class Motion:
             raise ValueError(f"{self.path} must be one of {', '.join(SUFFIXES)}{hint}")
         if suffix == ".csv" and fps is None:
             raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps (--fps), as 30, 50, 60 or 120")
-        self.fps, self.qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
+        self.fps, self._qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
         self._check()
-        self.qpos.setflags(write=False)  # what is made of it is read from the file again
+        self._qpos.setflags(write=False)  # what is made of it is read from the file again
 
     def __repr__(self) -> str:
         return f"Motion({str(self.path)!r}, fps={self.fps:g})"
+
+    @property
+    def name(self) -> str:
+        """The file's, without its suffix."""
+        return self.path.stem
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """The poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
+
+        Others are a motion of their own: :func:`torchrl_loco.motion.save` writes its file.
+        """
+        return self._qpos
 
     @property
     def seconds(self) -> float:
@@ -125,7 +136,7 @@ class Motion:
         except ValueError:
             widths = sorted({line.count(",") + 1 for line in lines})
             wrong = [
-                f"{word!r} in line {number}, column {column}"
+                f"{word[:40]!r} in line {number}, column {column}{'' if ',' in line else ', without a comma'}"
                 for number, line in numbered
                 for column, word in enumerate(line.split(","), start=1)
                 if number_of(word) is None
@@ -137,6 +148,8 @@ class Motion:
                 f"{self.path} must have rows of 7 numbers of the base and one of each joint, 36 for a G1; it has "
                 f"{f'rows of {table.shape[1]}' if lines else 'none'}"
             )
+        if np.array_equal(table[0], np.arange(table.shape[1])):
+            raise ValueError(f"{self.path} has the numbers of its columns in line {numbered[0][0]}: leave them out")
         return table[:, [0, 1, 2, 6, 3, 4, 5, *range(7, table.shape[1])]]
 
     def _from_npz(self, fps: float | None) -> tuple[float, np.ndarray]:
@@ -174,9 +187,10 @@ class Motion:
             raise ValueError(f"{self.path}: frame {frame} has a number that is not finite, in {which}")
         lengths = np.linalg.norm(q[:, 3:7], axis=1)
         if (wrong := np.flatnonzero(np.abs(lengths - 1.0) > NORM_ERROR)).size:
+            where = f", of {q.shape[1]} columns the 4th to the 7th," if self.path.suffix.lower() == ".csv" else ""
             raise ValueError(
-                f"{self.path}: the base's orientation in frame {wrong[0]} must be a unit quaternion, its length is "
-                f"{lengths[wrong[0]]:.3g}"
+                f"{self.path}: the base's orientation{where} in frame {wrong[0]} must be a unit quaternion, its length "
+                f"is {lengths[wrong[0]]:.3g}"
             )
         q[:, 3:7] /= lengths[:, None]
         speed = np.linalg.norm(np.diff(q[:, :3], axis=0), axis=1) * self.fps
@@ -258,7 +272,9 @@ class Motion:
         if self._bodies is None:
             return []
         there, names = self._bodies
-        bodies = _bodies_of(m)
+        bodies, base = _bodies_of(m), m.body(m.jnt_bodyid[0]).name
+        if names and names[0] != base and names[0] in bodies:
+            raise ValueError(f"{self.path}: the first body must be the base, {base!r}, it is {names[0]!r}")
         names = names or (bodies if there.shape[1] == len(bodies) else [])
         both = [name for name in names if name in bodies]
         if not both or len(names) != there.shape[1]:

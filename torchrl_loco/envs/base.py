@@ -96,8 +96,8 @@ class LocoEnv(WorldAccess, QuickResets):
         play: whether the worlds are for looking at a policy, not for training: commands can be set with
             :meth:`set_command`, ``randomize=None`` varies nothing, and tasks leave out noise and pushes.
         from_pixels: whether to return what a camera sees as ``"pixels"``, uint8 ``(num_envs, height, width, 3)``.
-        pixels_only: whether the groups of the observation are left out; ``None`` leaves them out where there are
-            pixels. Terms of the reward and metrics that are asked for stay.
+        pixels_only: whether the groups of the observation are left out; ``None`` leaves them out with
+            ``from_pixels``. Terms of the reward and metrics that are asked for stay.
         camera: name or number of a camera of the model; ``None`` takes the first.
         size: width and height of the pixels; ``None`` is 84 by 84.
         frame_stack: how many of the last pictures ``"pixels"`` holds, one after the other along its last dimension, the

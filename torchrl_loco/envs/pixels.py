@@ -55,7 +55,7 @@ class Pixels:
         camera = checked_camera(m, given["camera"])
         width, height = checked_size(SIZE if given["size"] is None else given["size"])
         kinds = tuple(kind for kind, wanted in (("rgb", with_rgb), ("depth", far > 0)) if wanted)
-        only = True if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
+        only = with_rgb if given["pixels_only"] is None else check_bool("pixels_only", given["pixels_only"])
         stack = 1 if given["frame_stack"] is None else check_int("frame_stack", given["frame_stack"])
         of_pixel = COPIES_IN_STEP * sum({"rgb": 3 * stack, "depth": 4}[kind] for kind in kinds)
         of_pixel += 3 * stack * (stack > 1)  # Seen.stack

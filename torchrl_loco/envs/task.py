@@ -387,13 +387,17 @@ NUMBERS: dict[type, Callable[[str, Any], Any]] = {
 
 
 def options_of_class(cls: type[Task]) -> dict[str, Any]:
-    """Returns values of options that classes set as attributes, below the one that declares the option."""
+    """Returns what classes below the one that declares an option set it to: as an attribute, or as another default."""
     found = {}
     for name in cls.options:
         *_, declares = (base for base in cls.__mro__ if name in vars(base).get("options", {}))
-        below = cls.__mro__[: cls.__mro__.index(declares)]
-        if values := [vars(base)[name] for base in below if name in vars(base)]:
-            found[name] = values[0]
+        declared = vars(declares)["options"][name]
+        for base in reversed(cls.__mro__[: cls.__mro__.index(declares)]):
+            again = vars(base).get("options", {}).get(name, declared)
+            if name in vars(base):
+                found[name] = vars(base)[name]
+            elif again is not declared and again[0] != found.get(name, declared[0]):
+                found[name] = again[0]
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-from torchrl_loco.checks import check_float
+from torchrl_loco.checks import NOT_NEGATIVE, check_float
 
 DEEP = 1.0  # how far boxes reach below what lies deepest in a patch (m)
 
@@ -43,7 +43,12 @@ def points(size: float, cell: float) -> np.ndarray:
 
 
 def ring(outer: float, width: float, top: float, bottom: float) -> list[list[float]]:
-    """Returns four boxes of a width, from bottom to top, within the edges of a square of half side ``outer`` (m)."""
+    """Returns four boxes of a width, from bottom to top, within the edges of a square of half side ``outer`` (m).
+
+    There are none of no width.
+    """
+    if width < 1e-9:
+        return []
     middle, half, z = outer - width / 2, width / 2, [(top + bottom) / 2, (top - bottom) / 2]
     long = [[0.0, sign * middle, z[0], outer, half, z[1]] for sign in (-1, 1)]
     return long + [[sign * middle, 0.0, z[0], half, outer - width, z[1]] for sign in (-1, 1)]
@@ -91,7 +96,7 @@ def rough(
     difficulty: float, rng: Generator, size: float, cell: float, height: Bounds = (0.02, 0.1), step: float = 0.01
 ) -> Patch:
     """Returns points of random heights: multiples of ``step`` (m), the largest of ``height`` (m)."""
-    most = round(between(height, difficulty) / step)
+    most = round(check_float("height of rough", between(height, difficulty), NOT_NEGATIVE) / check_float("step", step))
     return Patch(heights=step * rng.integers(0, most + 1, (len(points(size, cell)),) * 2))
 
 

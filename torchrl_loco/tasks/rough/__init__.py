@@ -83,9 +83,9 @@ class Rough(Velocity):
         ``weights["scrapes"]`` says for each physics step in which one of it has a hard contact.
 
     Start:
-        At rest in the home pose, just above the ground, in the middle of a patch of its level. The level rises when a
-        robot has left its patch, and falls when it fell, or made less than half of the way that its commands led;
-        after the last level comes a random one.
+        At rest in the home pose, just above the ground below feet and base, in the middle of a patch of its level;
+        nothing else may reach up to the trunk there. The level rises when a robot has left its patch, and falls when it
+        fell, or made less than half of the way that its commands led; after the last level comes a random one.
 
     Termination:
         When the trunk is tilted by more than 70 degrees; truncation after 1000 steps, where a robot has left its patch,
@@ -120,6 +120,8 @@ class Rough(Velocity):
             cls.config = dataclasses.replace(cls.config, solids_on_terrain="spheres")
         if laid and given.isdisjoint(("ground", "robot", "model", "feet")):
             return
+        if not isinstance(cls.ground, terrain.Terrain):
+            raise TypeError(f"ground of {cls.__name__} must be a torchrl_loco.terrain.Terrain, got {cls.ground!r}")
         if not hasattr(cls, "feet"):
             raise TypeError(f"{cls.__name__} must set feet: see help(torchrl_loco.Velocity)")
         if "model" in given or not hasattr(cls, "robot"):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchrl_loco import motion as motions
-from torchrl_loco.checks import Interval, check_int
+from torchrl_loco.checks import Interval, check_int, suggestion
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.rotations import product, small_turn
 from torchrl_loco.tasks.robots import Robot, actuated, either, hard_contacts, pushed, squares
@@ -150,14 +150,17 @@ class Tracking(Robot):
         bodies = list(cls.bodies)
         if apart := [name for name in (cls.base, cls.anchor, *cls.ends) if name not in bodies]:
             raise ValueError(f"bodies of {cls.__name__} must hold base, anchor and ends, but not {', '.join(apart)}")
+        if twice := [name for name in bodies if bodies.count(name) > 1]:
+            raise ValueError(f"bodies of {cls.__name__} has {twice[0]!r} twice")
         if bodies[0] != cls.base:
             raise ValueError(f"the first of bodies of {cls.__name__} must be the base, {cls.base!r}")
 
     @classmethod
     def faults(cls, m: mujoco.MjModel) -> list[str]:
         """Returns what is wrong with a model: also actuators that do not drive all joints, in the joints' order."""
-        joints = [m.joint(j).name for j in range(1, m.njnt)]
+        joints, bodies = [m.joint(j).name for j in range(1, m.njnt)], [m.body(i).name for i in range(1, m.nbody)]
         wrong = super().faults(m)
+        wrong += [f"it has no body {name!r}{suggestion(name, bodies)}" for name in cls.bodies if name not in bodies]
         if not wrong and actuated(m) != joints:
             wrong.append(f"it must have an actuator for each joint, in their order: {', '.join(joints)}")
         return wrong
@@ -175,7 +178,7 @@ class Tracking(Robot):
             raise ValueError("fps is that of motions in CSV files: pass motion too")
         check_int("max_delay", kept.get("max_delay", 0), Interval(0, cls.longest_delay, with_high=True))
         if "future" in kept:
-            steps = kept["future"] if isinstance(kept["future"], list | tuple) else [kept["future"]]
+            steps = [kept["future"]] if np.ndim(kept["future"]) == 0 else list(kept["future"])
             try:
                 kept["future"] = [
                     check_int("each of future", int(step) if isinstance(step, str) else step, AHEAD) for step in steps
