@@ -11,8 +11,8 @@ import math
 import numbers
 import operator
 import os
-from collections.abc import Collection, Sequence
-from pathlib import Path
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -108,6 +108,12 @@ def check_choice(name: str, value: Any, choices: Collection[str], also: Collecti
             + (f"choose one of {', '.join(choices)}" if choices else "there is none")
         )
     return value
+
+
+def several(value: Any) -> list[Any]:
+    """Returns a list of what may be one, as text, a path or a dict is, or several."""
+    is_one = isinstance(value, str | PurePath | Mapping) or not isinstance(value, Iterable)
+    return [value] if is_one else list(value)
 
 
 def suggestion(word: str, choices: Collection[str]) -> str:

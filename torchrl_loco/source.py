@@ -3,7 +3,7 @@
 import hashlib
 import inspect
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,11 @@ def files_of(cls: Any, path: Path) -> list[Path]:
 def source_of(task: str) -> str:
     """Returns a hash of what a user may edit of a task in files: those of its class and model."""
     return _digest(task).hexdigest()
+
+
+def is_edited(info: Mapping[str, Any], task: str) -> bool:
+    """Returns whether a task was edited since the training of a policy with this info, as far as that tells."""
+    return "source_hash" in info and info["source_hash"] != source_of(task)
 
 
 def _digest(task: str) -> Any:

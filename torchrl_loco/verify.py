@@ -27,7 +27,7 @@ from torchrl_loco.known_files import place_of
 from torchrl_loco.policy import check_terms, in_task, with_options, without_returns
 from torchrl_loco.registry import resolve
 from torchrl_loco.sim import models
-from torchrl_loco.source import source_of
+from torchrl_loco.source import is_edited
 
 ENGINES = ("C MuJoCo", "training simulator")
 UNDISTURBED = Conditions(delay=(0, 0), noise=0.0, pushes=0.0)  # in which each case of a task is played once
@@ -120,8 +120,7 @@ def verify(
     info = exported.facts.get("info", {})
     if options is not None and (given := options(exported.facts["task"])):
         info = with_options(info, given)
-    source = source_of(exported.facts["task"])
-    if info.get("source_hash", source) != source:
+    if is_edited(info, exported.facts["task"]):
         say = logging.getLogger("torchrl_loco").warning
         say("%s was edited since the training, whose return is not compared", exported.facts["task"])
         info = without_returns(info)

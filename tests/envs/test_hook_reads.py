@@ -243,6 +243,11 @@ def test_forces_of_actuators_are_mujocos():
             mujoco.mj_forward(m, data)
             np.testing.assert_allclose(found[world], data.actuator_force, rtol=1e-5, atol=1e-6)
         assert found.abs().max() == 8.0  # one is at its limit
+    off = Driven.model.replace(
+        '<option timestep="0.01"/>', '<option timestep="0.01"><flag actuation="disable"/></option>'
+    )
+    with pytest.raises(ValueError, match="actuators that work"):
+        type("Off", (Driven,), {"model": off})(1, "cpu", engine="mujoco")
     lifts = type("Lift", (QuadrupedWalk,), {"reward": lambda self, s: s.actuator_force.sum(-1)})
     with pytest.raises(ValueError, match="motors and servos at hinges and slides"):
         lifts(1, "cpu", engine="mujoco")

@@ -237,7 +237,7 @@ def test_memory_is_written_by_update_and_events_and_seen_in_this_order():
             return {"steps": s.steps + 1}
 
         def reward(self, s):
-            return {"steps": s.steps, "before": s.before}
+            return {"steps": s.steps * (self.episode_length == 3), "before": s.before}
 
         def events(self, s):
             return {"before": s.steps, "seen": torch.stack([s.steps, s.before], dim=-1)}
@@ -594,6 +594,7 @@ BASE = {"model": DOG, "config": CONFIG, "reward": lambda self, s: s.time, "obser
 MAGNETIC = DOG.replace("<accelerometer", "<magnetometer").replace("<option", '<option magnetic="0 1 -2"', 1)
 WRONG = [
     ({"reward": None}, TypeError, "must define reward"),
+    ({"metrics": 3}, TypeError, "metrics must be a method, got 3"),
     ({"config": 1}, TypeError, "config must be a torchrl_loco.SimConfig"),
     ({"model": "nowhere.xml"}, FileNotFoundError, "no model 'nowhere.xml'"),
     ({"reward": lambda self, s: s.qpos}, ValueError, r"must return shape \(4,\)"),
@@ -863,6 +864,10 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
     type("Floating", (LocoEnv,), entries)(1, "cpu", 0)
     assert "bodies fall for ever" in caplog.text
     assert "no actuators" in caplog.text
+    filtered = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>
+<position joint="j" timeconst=".5" ctrlrange="-1 1"/></actuator><keyframe><key name="home" qpos=".6" act=".6"/></keyframe></mujoco>"""
+    type("Filtered", (LocoEnv,), {**entries, "model": filtered})(1, "cpu", 0)
+    assert "those of the keyframe 'home' are not used" in caplog.text
     entries["control"] = lambda self, s, action: s.time.unsqueeze(-1)
     with pytest.raises(ValueError, match=r"control must return shape \(1, 0\)"):
         type("Moved", (LocoEnv,), entries)(1, "cpu", 0)
@@ -1026,6 +1031,14 @@ def test_options_are_arguments_attributes_and_part_of_a_run(tmp_path):
         type("Twice", (Falling,), {"options": {"speed": (1.0, "Speed (m/s).")}, "speed": 2.0})(1, "cpu")
     with pytest.raises(ValueError, match="'gpus' is a setting of training, too"):
         training.preset(type("Taken", (Falling,), {"options": {"gpus": (1, "Cards.")}}), "cpu")
+    pair = type(
+        "Pair", (Falling,), {"options": {**Falling.options, "pair": ((0.5, 1.0), "Two."), "names": ((), "Some.")}}
+    )
+    env = pair(1, "cpu", 0, pair=np.array([1, 2]), names="x", on_overflow="ignore")
+    assert (env.pair, env.names, env.options_given) == ((1.0, 2.0), ("x",), {"pair": [1.0, 2.0], "names": ["x"]})
+    assert pair(1, "cpu", 0, on_overflow="ignore").pair == (0.5, 1.0)
+    with pytest.raises(TypeError, match="option 'pair' must be"):
+        pair(1, "cpu", pair=("a", "b"))
     config = training.preset(Falling, "cpu", height=3.0)
     assert config.options == {"height": 3.0}
     assert config.of_env["height"] == 3.0

@@ -130,6 +130,7 @@ def test_errors_of_the_user(ppo_run, tmp_path, capsys):
         "train walker_walk --learning_rate=0.1": "unknown setting 'learning_rate': choose one of action_repeat",
         "train walker_walk --device cpu --kl_bound 0.1": "--kl_bound is a setting of --algorithm reppo",
         "train walker_walk --task walker_run": "unknown setting 'task'",
+        "train walker_walk --ctrl-dt 0.02": "--ctrl_dt is a field of the simulation: write --sim.ctrl_dt",
         "eval no/such/run": "there is no run folder or policy file 'no/such/run', and unknown environment",
         "eval {run} --policy {swapped}": "{run} is no task: with --policy, the first word is the task to play in",
         "eval {run} --episodes 0": "episodes must lie in [1, 2**31)",

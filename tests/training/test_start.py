@@ -604,3 +604,6 @@ def test_an_option_that_is_edited_selects_the_best_policy_anew(tmp_path, capsys)
         train(f"{file}:Paid", resume=run.path, total_frames=total)
         assert ("was edited since" in capsys.readouterr().err) == said
     assert run.load_policy("cpu").info["selected_by"] < 2000
+    file.write_text(file.read_text().replace("s.qpos[:, 1]", "s.qpos[:, 2]"))
+    assert cli.main(["eval", str(run.path), "--episodes", "1", "--device", "cpu"]) == 0
+    assert "was edited since the training of this policy" in capsys.readouterr().err

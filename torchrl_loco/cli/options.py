@@ -158,16 +158,19 @@ def _check_names(args: list[str], config: Any) -> None:
     """Checks that options are settings: the parser's own message does not say which there are."""
     settings_of = {algorithm: {field.name for field in dataclasses.fields(kind)} for algorithm, kind in CONFIGS.items()}
     mine = {field.name for field in dataclasses.fields(config)} - {"task", "options"} | set(_of_task(config.task))
+    of_sim = [field.name for field in dataclasses.fields(Sim)]
     for arg in args:
         name = arg.partition("=")[0].removeprefix("--").replace("-", "_")
         if not arg.startswith("--") or name.removeprefix("no_") in mine or name in ("", "help"):
             continue
         if name.startswith("sim."):
-            check_choice("field of --sim", name.removeprefix("sim."), [field.name for field in dataclasses.fields(Sim)])
+            check_choice("field of --sim", name.removeprefix("sim."), of_sim)
             continue
         for algorithm, names in settings_of.items():
             if name in names - settings_of[config.algorithm]:
                 raise ValueError(f"--{name} is a setting of --algorithm {algorithm}, and this is {config.algorithm}")
+        if name in of_sim:
+            raise ValueError(f"--{name} is a field of the simulation: write --sim.{name}")
         check_choice("setting", name, sorted(mine | {"device", "algorithm"}))
 
 

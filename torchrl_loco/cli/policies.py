@@ -52,6 +52,10 @@ class Which(Motions):
         Its task is the one that is named: ``task``, or ``run_or_task`` if ``policy`` says where the policy is.
         """
         policy, beside = self._load(run_or_task, device)
+        from torchrl_loco.source import is_edited  # with torch, as a policy is
+
+        if is_edited(policy.info, policy.info["task"]):
+            print(f"{policy.info['task']} was edited since the training of this policy", file=sys.stderr)
         if given := self.given(policy.info["task"]):
             policy.info = torchrl_loco.policy.with_options(policy.info, given)
         return policy, beside

@@ -48,6 +48,8 @@ def _check(m: mujoco.MjModel) -> None:
         & (m.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
         & np.isin(m.actuator_biastype, (mujoco.mjtBias.mjBIAS_NONE, AFFINE))
     )
+    if m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):
+        raise ValueError("s.actuator_force is of actuators that work: the model has <flag actuation='disable'/>")
     if not plain.all():
         names = ", ".join(m.actuator(int(i)).name or str(i) for i in np.flatnonzero(~plain)[:3])
         raise ValueError(

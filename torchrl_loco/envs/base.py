@@ -161,6 +161,7 @@ class LocoEnv(WorldAccess, QuickResets):
         given = {name: config.pop(name) for name in self.options if name in config}
         options_given = self.checked_options({**options_of_class(type(self)), **given})
         own = {name: options_given.get(name, default) for name, (default, _) in self.options.items()}
+        own |= {name: tuple(own[name]) for name, (default, _) in self.options.items() if isinstance(default, tuple)}
         arguments = [*list(inspect.signature(LocoEnv.__init__).parameters)[1:-1], *own]
         of_class = type(self).config
         if self.episode_length is not None:
@@ -196,6 +197,7 @@ class LocoEnv(WorldAccess, QuickResets):
         self.num_envs, self.world_offset = worlds, world_offset
         self.seed = secrets.randbits(32) if seed is None else seed
         self.protocol, self.config, self.mj_model = protocol, sim_settings, mj_model
+        self.episode_length = sim_settings.episode_length
         self._replaced = replaced_options(type(self), mj_model, sim_settings)
         _say_what_is_missing(mj_model)
         self.with_metrics, self.noise_scale = with_metrics, noise_scale
@@ -228,7 +230,8 @@ class LocoEnv(WorldAccess, QuickResets):
         self.reward_terms = reward_terms and len(self.term_names) > 0
         self._stepped_model = self._without_unread_sensors(hooks)
         if play and (cases := self.cases()) and "episode_length" not in config:  # each is played to its end
-            self.config = dataclasses.replace(self.config, episode_length=max(cases.values()))
+            self.episode_length = max(cases.values())
+            self.config = dataclasses.replace(self.config, episode_length=self.episode_length)
         self._open()
         self._make_specs()
 
@@ -480,3 +483,5 @@ def _say_what_is_missing(m: mujoco.MjModel) -> None:
         say("nothing that is fixed to the world touches anything: bodies fall for ever. Add a plane")
     if m.nu == 0:
         say("the model has no actuators: actions change nothing")
+    if models.has_home(m) and m.key("home").act.any():
+        say("episodes begin with activations of 0: those of the keyframe 'home' are not used")

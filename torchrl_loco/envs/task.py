@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from torchrl_loco.checks import ANY, EXTENDED, check_bool, check_choice, check_float, check_int, check_pair
+from torchrl_loco.checks import ANY, EXTENDED, check_bool, check_choice, check_float, check_int, check_pair, several
 from torchrl_loco.conditions import Conditions
 from torchrl_loco.config import SimConfig, options_of
 from torchrl_loco.envs.episode import MAX_VALUE
@@ -99,8 +99,9 @@ class Task:
     set, and the viewer has a slider for each."""
     randomize: Sequence[Vary] = ()
     """Numbers of the model that each world draws at its resets; see :class:`torchrl_loco.Vary`."""
-    episode_length: ClassVar[int | None] = None
-    """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`."""
+    episode_length: int | None = None
+    """Control steps after which an episode is truncated; ``None`` takes that of :attr:`config`. An environment's is the
+    number that holds in it."""
     action_range: Sequence[float] = BOUNDED
     """(-1, 1), or (-inf, inf) for actions without bounds, which need an own :meth:`control`."""
     perfect: ClassVar[Mapping[str, float]] = {}
@@ -318,6 +319,8 @@ class Task:
         _warn_of_a_length_that_is_not_used(cls)
         if not isinstance(cls.model, str | Path | mujoco.MjSpec):
             raise TypeError(f"{name}.model must be a path, MJCF text or a mujoco.MjSpec, got {cls.model!r}")
+        if wrong := [hook for hook in HOOKS if not callable(getattr(cls, hook))]:
+            raise TypeError(f"{name}.{wrong[0]} must be a method, got {getattr(cls, wrong[0])!r}")
         lacking = [hook for hook in ("reward", "observation") if hook not in own]
         if lacking and cls.observation_func is Task.observation_func:
             raise TypeError(f"{name} must define {' and '.join(f'{hook}(self, s)' for hook in lacking)}")
@@ -366,8 +369,10 @@ class Task:
 
     @classmethod
     def _option(cls, name: str, value: Any) -> Any:
-        check = NUMBERS.get(type(cls.options[name][0]))
-        return value if check is None else check(f"{cls.__name__}: option {name!r}", value)
+        default, words = cls.options[name][0], f"{cls.__name__}: option {name!r}"
+        is_tuple = isinstance(default, tuple)
+        check = NUMBERS.get(type((*default, "")[0] if is_tuple else default), lambda _, each: each)
+        return [check(words, each) for each in several(value)] if is_tuple else check(words, value)
 
     @classmethod
     def check_model(cls, mj_model: mujoco.MjModel) -> None:
@@ -383,7 +388,7 @@ NUMBERS: dict[type, Callable[[str, Any], Any]] = {
     int: functools.partial(check_int, interval=ANY),
     float: functools.partial(check_float, interval=EXTENDED),
 }
-"""What looks at the value of an option, by the type of its default; text and tuples are looked at by their task."""
+"""What looks at a value of an option, by the type of its default; text is looked at by its task."""
 
 
 def options_of_class(cls: type[Task]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchrl_loco import motion as motions
-from torchrl_loco.checks import Interval, check_int, suggestion
+from torchrl_loco.checks import Interval, check_int, several, suggestion
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.rotations import product, small_turn
 from torchrl_loco.tasks.robots import Robot, actuated, either, hard_contacts, pushed, squares
@@ -170,18 +170,17 @@ class Tracking(Robot):
         """Returns options as a run keeps them: with the whole paths of files."""
         kept = super().checked_options(given)
         if "motion" in kept:
-            several = kept["motion"] if isinstance(kept["motion"], list | tuple) else [kept["motion"]]
-            if not several:
+            kept["motion"] = [_kept(one) for one in several(kept["motion"])]
+            if not kept["motion"]:
                 raise ValueError("motion names none: without it, the motions of the package are followed")
-            kept["motion"] = [_kept(one) for one in several]
         elif kept.get("fps"):
             raise ValueError("fps is that of motions in CSV files: pass motion too")
         check_int("max_delay", kept.get("max_delay", 0), Interval(0, cls.longest_delay, with_high=True))
         if "future" in kept:
-            steps = [kept["future"]] if np.ndim(kept["future"]) == 0 else list(kept["future"])
             try:
                 kept["future"] = [
-                    check_int("each of future", int(step) if isinstance(step, str) else step, AHEAD) for step in steps
+                    check_int("each of future", int(step) if isinstance(step, str) else step, AHEAD)
+                    for step in several(kept["future"])
                 ]
             except (TypeError, ValueError) as error:
                 raise ValueError(f"future must be whole numbers of control steps, 1 or more: {error}") from None
@@ -201,7 +200,6 @@ class Tracking(Robot):
             ValueError: a motion does not fit the robot, or there are too many.
             OSError: a file is not there.
         """
-        self.future = tuple(int(step) for step in self.future)
         self.frames = f = self._frames()
         clips = len(f.names)
         if clips > 1:
