@@ -865,7 +865,8 @@ def test_a_body_without_a_floor_or_actuators_is_told_of(caplog):
     assert "bodies fall for ever" in caplog.text
     assert "no actuators" in caplog.text
     filtered = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><actuator>
-<position joint="j" timeconst=".5" ctrlrange="-1 1"/></actuator><keyframe><key name="home" qpos=".6" act=".6"/></keyframe></mujoco>"""
+<position joint="j" timeconst=".5" ctrlrange="-1 1"/></actuator>
+<keyframe><key name="home" qpos=".6" act=".6"/></keyframe></mujoco>"""
     type("Filtered", (LocoEnv,), {**entries, "model": filtered})(1, "cpu", 0)
     assert "those of the keyframe 'home' are not used" in caplog.text
     entries["control"] = lambda self, s, action: s.time.unsqueeze(-1)
