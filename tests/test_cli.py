@@ -180,6 +180,12 @@ class Named(WalkerStand):
 
 class Whole(Named):
     speed, names = 1, ["a.csv", "b.csv"]
+
+class Pair(WalkerStand):
+    options = {"pair": ((0.5, 1.0), "Two.")}
+
+class Ints(Pair):
+    pair = range(2, 4)
 """
 
 
@@ -192,6 +198,8 @@ def test_an_option_has_the_value_of_the_class_and_errors_in_a_hook_have_a_place(
         assert _of_task(f"{file}:{name}")["wind"][:2] == (False, blows)
     resolve(f"{file}:Whole", by_user=True)
     assert [entry[1] for entry in _of_task(f"{file}:Whole").values()] == [1.0, ("a.csv", "b.csv")]
+    resolve(f"{file}:Ints", by_user=True)
+    assert _of_task(f"{file}:Ints")["pair"][1] == (2.0, 3.0)
     with pytest.raises(SystemExit):
         cli.main(["train", f"{file}:Windy", "--device", "cpu", "--no_wind", "--out", str(tmp_path)])
     assert f"({file}, line 9, in reward)" in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """Motions: read from files, refused where something is wrong, resampled, and what is found of them."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -123,8 +125,11 @@ def test_what_is_no_motion_is_refused(tmp_path, g1, rows):
         Motion(tmp_path / "clip.pkl")
     with pytest.raises(FileNotFoundError):
         Motion(tmp_path / "none.csv", fps=50.0)
+    motion = copy.deepcopy(Motion(PUNCHES, fps=OWN_RATE))
     with pytest.raises(AttributeError):  # it is read from its file again
-        Motion(PUNCHES, fps=OWN_RATE).qpos = np.zeros((5, 36))
+        motion.qpos = np.zeros((5, 36))
+    with pytest.raises(ValueError, match="read-only"):
+        motion.qpos[0] = 0.0
 
 
 def test_an_npz_that_does_not_fit_is_refused(tmp_path, g1, rows):

@@ -206,8 +206,14 @@ def test_another_bodys_observations_are_refused(policy, shared):
 
 
 def test_what_a_policy_earned_is_of_its_task():
-    """In another task neither that holds, nor options that it does not have."""
-    info = {"protocol": "playground", "mean": 12.5, "selected_by": 13.0, "options": {"future": (1, 2), "speed": 2.0}}
+    """In another task neither that holds, nor options that it does not have, nor whether it was edited."""
+    info = {
+        "source_hash": "of the other",
+        "protocol": "playground",
+        "mean": 12.5,
+        "selected_by": 13.0,
+        "options": {"future": (1, 2), "speed": 2.0},
+    }
     assert in_task(info, "walker_stand", "walker_stand") == {**info, "task": "walker_stand"}
     assert in_task(info, "a.py:Walk", "b.py:Walk~2")["mean"] == in_task(info, "m:WalkerWalk", "walker_walk")["mean"]
     assert in_task(info, "walker_stand", "walker_walk") == {"protocol": "playground", "task": "walker_walk"}

@@ -228,6 +228,9 @@ def test_what_a_subclass_sets_stays_but_for_the_ground_under_its_robot(tmp_path)
     mixed = type("Mixed", (Wide, Hills), {})
     assert mixed.model.hfields[0].size[0] == max(Wide.ground.half) != max(Hills.ground.half)
     assert Long.config.solids_on_terrain == "spheres"
+    short, whole = (Hills(1, "cpu", 0, on_overflow="ignore", **length) for length in ({"episode_length": 9}, {}))
+    short.load_state_dict(whole.state_dict())  # the same cases
+    assert short.episode_length == 9
     with pytest.raises(TypeError, match=r"ground of Groundless must be a .*Terrain, got 'stairs'"):
         type("Groundless", (loco.Go1Rough,), {"ground": "stairs"})
     with pytest.raises(TypeError, match="Footless must set feet"):

@@ -275,6 +275,9 @@ def test_motions_are_given_as_files_and_objects_and_wrong_ones_are_refused(tmp_p
     assert loco.make("h1_tracking", 1, "cpu", 0, future=range(1, 3), **PLAIN).future == (1, 2)
     other = {**H1Tracking.options, "motion": (str(short), "Short ones."), "fps": (25.0, "Theirs.")}
     assert list(type("Others", (H1Tracking,), {"options": other})(1, "cpu", 0, **PLAIN).cases()) == ["a", "b"]
+    ahead = type("Ahead", (H1Tracking,), {"options": {**H1Tracking.options, "future": ((1, 2), "Frames.")}})
+    env = ahead(1, "cpu", 0, **PLAIN)
+    assert (list(env.future), ahead.facts(env.mj_model, {})["tracking"]["future"]) == ([1, 2], [1, 2])
     sees = type("Sees", (loco.H1Tracking,), {"future": (1, 2)})  # as a class's attribute
     assert (sees(1, "cpu", 0, **PLAIN).future, sees(1, "cpu", 0, future=(), **PLAIN).future) == ((1, 2), ())
     for future in ((-1,), (0,), ("a",), 1.5):

@@ -112,7 +112,8 @@ def check_choice(name: str, value: Any, choices: Collection[str], also: Collecti
 
 def several(value: Any) -> list[Any]:
     """Returns a list of what may be one, as text, a path or a dict is, or several."""
-    is_one = isinstance(value, str | PurePath | Mapping) or not isinstance(value, Iterable)
+    is_one = isinstance(value, str | bytes | PurePath | Mapping) or not isinstance(value, Iterable)
+    is_one |= getattr(value, "ndim", 1) == 0  # an array or tensor
     return [value] if is_one else list(value)
 
 

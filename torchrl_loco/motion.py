@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from torchrl_loco.checks import check_bool, check_float, number_of, suggestion
+from torchrl_loco.checks import check_bool, check_float, number_of, several, suggestion
 from torchrl_loco.storage import replace_file
 
 SUFFIXES = (".csv", ".npz")  # of files that motions are read from
@@ -84,7 +84,6 @@ class Motion:
             raise ValueError(f"{self.path}: a CSV file does not say its rate: pass fps (--fps), as 30, 50, 60 or 120")
         self.fps, self._qpos = (fps or 0.0, self._from_csv()) if suffix == ".csv" else self._from_npz(fps)
         self._check()
-        self._qpos.setflags(write=False)  # what is made of it is read from the file again
 
     def __repr__(self) -> str:
         return f"Motion({str(self.path)!r}, fps={self.fps:g})"
@@ -98,9 +97,11 @@ class Motion:
     def qpos(self) -> np.ndarray:
         """The poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
 
-        Others are a motion of their own: :func:`torchrl_loco.motion.save` writes its file.
+        They cannot be written, since a training reads the file again: :func:`torchrl_loco.motion.save` writes others.
         """
-        return self._qpos
+        poses = self._qpos.view()
+        poses.setflags(write=False)
+        return poses
 
     @property
     def seconds(self) -> float:
@@ -178,7 +179,7 @@ class Motion:
 
     def _check(self) -> None:
         """Checks all that needs no model."""
-        q = self.qpos
+        q = self._qpos
         if len(q) < 2:
             raise ValueError(f"{self.path} has {len(q)} frames: a motion has at least 2")
         if (bad := np.argwhere(~np.isfinite(q))).size:
@@ -330,7 +331,7 @@ def read(motion: Any, fps: float = 0.0) -> list[Motion]:
 def named(motion: Any, fps: float = 0.0) -> list[Motion | dict[str, Any]]:
     """Returns the motions that are named, as :func:`read` takes them; of files, the arguments of :class:`Motion`."""
     found = list[Motion | dict[str, Any]]()
-    for one in motion if isinstance(motion, list | tuple) else [motion]:
+    for one in several(motion):
         if isinstance(one, Motion):
             found.append(one)
         elif isinstance(one, Mapping):

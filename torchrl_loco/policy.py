@@ -93,7 +93,7 @@ def in_task(info: Mapping[str, Any], trained: str, task: str) -> dict[str, Any]:
     here, there = (name.rpartition(":")[2].partition("~")[0] for name in (task, trained))
     if here == there or (cls := resolve(task)).__qualname__ == there:  # of an id, the class may have been named
         return {**info, "task": task}
-    kept = without_returns(info)
+    kept = {name: value for name, value in without_returns(info).items() if name != "source_hash"}
     options = {name: value for name, value in kept.pop("options", {}).items() if name in cls.options}
     return {**kept, "task": task, **({"options": options} if options else {})}
 

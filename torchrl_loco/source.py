@@ -76,5 +76,6 @@ def _written(cls: type) -> Iterator[str]:
 
 def _steps(code: types.CodeType) -> str:
     """Returns what a function does, wherever it is written."""
-    constants = [_steps(each) if isinstance(each, types.CodeType) else repr(each) for each in code.co_consts]
+    sets = (sorted(each, key=repr) if isinstance(each, frozenset) else each for each in code.co_consts)  # in any order
+    constants = [_steps(each) if isinstance(each, types.CodeType) else repr(each) for each in sets]
     return f"{code.co_code.hex()} {code.co_names} {constants}"

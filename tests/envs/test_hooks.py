@@ -1038,6 +1038,15 @@ def test_options_are_arguments_attributes_and_part_of_a_run(tmp_path):
     env = pair(1, "cpu", 0, pair=np.array([1, 2]), names="x", on_overflow="ignore")
     assert (env.pair, env.names, env.options_given) == ((1.0, 2.0), ("x",), {"pair": [1.0, 2.0], "names": ["x"]})
     assert pair(1, "cpu", 0, on_overflow="ignore").pair == (0.5, 1.0)
+    # The nearest class counts, whether it says a value or another default.
+    again = {name: (default, words) for name, (default, words) in Falling.options.items()}
+    high = type("High", (Falling,), {"options": {**again, "height": (4.0, "Other.")}})
+    classes = {
+        4.0: type("Same", (high,), {}),
+        1.0: type("First", (high,), {"options": {**Falling.options, "more": (1, "More.")}}),
+        3.0: type("Value", (high,), {"height": 3.0}),
+    }
+    assert [cls(1, "cpu", 0, on_overflow="ignore").height for cls in classes.values()] == [*classes]
     with pytest.raises(TypeError, match="option 'pair' must be"):
         pair(1, "cpu", pair=("a", "b"))
     config = training.preset(Falling, "cpu", height=3.0)

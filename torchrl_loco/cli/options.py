@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 
 from torchrl_loco import tasks
-from torchrl_loco.checks import check_choice
+from torchrl_loco.checks import check_choice, several
 from torchrl_loco.cli.errors import user_errors
 from torchrl_loco.registry import list_envs, resolve, summary, task_name
 from torchrl_loco.training.config import CONFIGS, Sim, TrainingConfig, preset, tuning_note
@@ -133,19 +133,19 @@ def _of_task(task: str) -> Mapping[str, tuple[Any, Any, str]]:
     cls = resolve(task)
     from torchrl_loco.envs.task import options_of_class  # with torch, as the class is
 
-    own = options_of_class(cls)
+    own = cls.checked_options(options_of_class(cls))
     return {name: (value, _of_kind(value, own.get(name, value)), words) for name, (value, words) in cls.options.items()}
 
 
 def _of_kind(declared: Any, value: Any) -> Any:
     """Returns a value as one of the kind that is declared, and what is declared if it is none, such as an object."""
-    several = isinstance(declared, tuple)
-    kind: Any = type((*declared, "")[0] if several else declared)
-    parts = list(value) if isinstance(value, tuple | list) else [value]
+    is_tuple = isinstance(declared, tuple)
+    kind: Any = type((*declared, "")[0] if is_tuple else declared)
+    parts = several(value)
     taken = {float: (int, float), str: (str, Path)}.get(kind, kind)
-    if not all(isinstance(part, taken) for part in parts) or not (several or len(parts) == 1):
+    if not all(isinstance(part, taken) for part in parts) or not (is_tuple or len(parts) == 1):
         return declared
-    return tuple(map(kind, parts)) if several else kind(parts[0])
+    return tuple(map(kind, parts)) if is_tuple else kind(parts[0])
 
 
 def _annotated(value: Any, words: str) -> Any:

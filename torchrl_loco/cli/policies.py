@@ -46,7 +46,9 @@ class Which(Motions):
     """A run folder or a policy file, to play in the task that is named."""
     task: OtherTask = None
 
-    def load(self, run_or_task: str, device: str | None) -> tuple["torchrl_loco.Policy", Path]:
+    def load(
+        self, run_or_task: str, device: str | None, *, tells_edits: bool = True
+    ) -> tuple["torchrl_loco.Policy", Path]:
         """Returns a policy, and the path from which the default names of its video and of its export derive.
 
         Its task is the one that is named: ``task``, or ``run_or_task`` if ``policy`` says where the policy is.
@@ -54,7 +56,7 @@ class Which(Motions):
         policy, beside = self._load(run_or_task, device)
         from torchrl_loco.source import is_edited  # with torch, as a policy is
 
-        if is_edited(policy.info, policy.info["task"]):
+        if tells_edits and is_edited(policy.info, policy.info["task"]):
             print(f"{policy.info['task']} was edited since the training of this policy", file=sys.stderr)
         if given := self.given(policy.info["task"]):
             policy.info = torchrl_loco.policy.with_options(policy.info, given)
@@ -403,7 +405,7 @@ def verify(
             named = which.task if which.policy is None else run_task_or_file
             named = None if named is None else _task(named)
         else:
-            exported, beside = which.load(run_task_or_file, "cpu")
+            exported, beside = which.load(run_task_or_file, "cpu", tells_edits=False)  # verify itself does
             if reason := torchrl_loco.export.why_not(exported):
                 raise ValueError(f"{run_task_or_file} cannot be verified: {reason}")
             if alone:  # before the export, which takes seconds

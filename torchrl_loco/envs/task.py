@@ -396,13 +396,14 @@ def options_of_class(cls: type[Task]) -> dict[str, Any]:
     found = {}
     for name in cls.options:
         *_, declares = (base for base in cls.__mro__ if name in vars(base).get("options", {}))
-        declared = vars(declares)["options"][name]
+        last = vars(declares)["options"][name]
         for base in reversed(cls.__mro__[: cls.__mro__.index(declares)]):
-            again = vars(base).get("options", {}).get(name, declared)
+            again = vars(base).get("options", {}).get(name, last)
             if name in vars(base):
                 found[name] = vars(base)[name]
-            elif again is not declared and again[0] != found.get(name, declared[0]):
+            elif again is not last:
                 found[name] = again[0]
+            last = again
     return found
 
 

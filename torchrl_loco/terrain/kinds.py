@@ -47,7 +47,7 @@ def ring(outer: float, width: float, top: float, bottom: float) -> list[list[flo
 
     There are none of no width.
     """
-    if width < 1e-9:
+    if abs(width) < 1e-9:
         return []
     middle, half, z = outer - width / 2, width / 2, [(top + bottom) / 2, (top - bottom) / 2]
     long = [[0.0, sign * middle, z[0], outer, half, z[1]] for sign in (-1, 1)]

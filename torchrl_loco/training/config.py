@@ -24,6 +24,7 @@ from torchrl_loco.checks import (
     check_packages,
     checked_size,
     is_run,
+    several,
     within,
 )
 from torchrl_loco.config import PROTOCOLS, SimConfig, arguments_of
@@ -191,10 +192,9 @@ class TrainingConfig:
         object.__setattr__(self, "out", Path(self.out))
         for field in (*self.widths, "strides"):
             what, value = "stride" if field == "strides" else "width", getattr(self, field)
-            several = value if isinstance(value, list | tuple) else [value]
-            if not several:
+            if not (sizes := several(value)):
                 raise ValueError(f"{field} must name the {what} of at least one layer")
-            object.__setattr__(self, field, tuple(check_int(f"each {what} of {field}", each) for each in several))
+            object.__setattr__(self, field, tuple(check_int(f"each {what} of {field}", each) for each in sizes))
         object.__setattr__(self, "size", checked_size(self.size))
         object.__setattr__(self, "sim", checked_sim(self.sim))
         object.__setattr__(self, "options", Options(self.options))

@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDictBase
 from tqdm.auto import tqdm
 
-from torchrl_loco.checks import check_device
+from torchrl_loco.checks import check_device, several
 from torchrl_loco.collector import RolloutCollector
 from torchrl_loco.envs.access import set_stage
 from torchrl_loco.envs.imagined import STATE
@@ -631,5 +631,5 @@ def _rounded(value: float) -> str:
 
 def _numbers_of(options: Mapping[str, Any]) -> dict[str, Any]:
     """Returns options but those of text, such as places of files: what these hold is in the content of a run."""
-    lists = {name: list(value) if isinstance(value, tuple | list) else [value] for name, value in options.items()}
+    lists = {name: several(value) for name, value in options.items()}
     return {name: parts for name, parts in lists.items() if not any(isinstance(part, str) for part in parts)}

@@ -14,6 +14,7 @@ from torchrl_loco import motion as motions
 from torchrl_loco.checks import Interval, check_int, several, suggestion
 from torchrl_loco.conditions import PUSH_EVERY
 from torchrl_loco.envs.rotations import product, small_turn
+from torchrl_loco.envs.task import options_of_class
 from torchrl_loco.tasks.robots import Robot, actuated, either, hard_contacts, pushed, squares
 from torchrl_loco.tasks.velocity import G1Velocity, H1Velocity
 
@@ -280,7 +281,8 @@ class Tracking(Robot):
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns how actions become targets of the joints, which bodies are followed about which, and frames ahead."""
         tracking: dict[str, Any] = {"base": cls.base, "anchor": cls.anchor, "bodies": list(cls.bodies)}
-        tracking["future"] = [int(steps) for steps in info.get("options", {}).get("future", getattr(cls, "future", ()))]
+        options = cls.checked_options({**options_of_class(cls), **info.get("options", {})})
+        tracking["future"] = options.get("future", [])
         return {**super().facts(m, info), "tracking": tracking}
 
     # The hooks, in the order in which they are called.
