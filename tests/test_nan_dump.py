@@ -219,8 +219,32 @@ def test_a_hook_that_gives_what_is_not_finite_is_told_from_the_physics(file, act
     with pytest.warns(NonFiniteWarning):
         env.close()
     *_, said = nan_dump.describe(nan_dump.load(file))
-    assert said == (
-        "state, action and physics are finite: a hook (control, reward, observation, memory) gave what is not"
+    assert said == "state, action and physics are finite: reward gave what is not"
+
+
+class Remembers(torchrl_loco.WalkerWalk):
+    """What is not finite is of the time that it remembers."""
+
+    memory = {"since": ()}
+
+    def update(self, s):
+        return {"since": s.since + s.dt}
+
+    def reward(self, s):
+        return {"period": s.dt / s.since, "left": (0.06 - s.since).sqrt()}
+
+
+def test_memory_is_not_in_the_file_which_is_said(file, actions):
+    env = Remembers(WORLDS, "cpu", 7, nan_dump=file)
+    td = env.reset()
+    for action in actions(env, 4):
+        td = stepped(env, td, action)
+    with pytest.warns(NonFiniteWarning):
+        env.close()
+    said = list(nan_dump.describe(nan_dump.load(file)))
+    assert said[1].startswith("memory, and what worlds share, are not in the file: hooks see zeros")
+    assert said[-1].endswith(
+        "a hook (control, reward, observation, memory) gave what is not; with memory of zeros none"
     )
 
 

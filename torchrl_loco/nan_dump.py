@@ -43,17 +43,20 @@ class NanDump:
     settings: dict[str, Any]
 
     def make_env(self, device: torch.device | str | None = None, **config: Any) -> LocoEnv:
-        """Returns an environment of one world with the settings of the dump, and ``config`` on top."""
+        """Returns an environment of that world alone with the settings of the dump, and ``config`` on top."""
         of_file = dataclasses.asdict(SimConfig(**self.settings["config"]))  # nothing else, such as a file to write
         env, settings = _class_of(self.settings), {**of_file, **self.settings.get("options", {}), **config}
         arguments = (1, device, self.settings["seed"], self.settings["protocol"])
         varys = [Vary(**vary) for vary in self.settings.get("randomize", [])]
-        return env(*arguments, world_offset=0, on_overflow="ignore", randomize=varys, **settings)
+        world = self.settings.get("world_offset", 0) + self.settings.get("world", 0)
+        return env(*arguments, world_offset=world, on_overflow="ignore", randomize=varys, **settings)
 
     @property
     def state(self) -> State:
-        """The state before the step, of one world."""
+        """The state before the step, of one world; of memory, and what worlds share, a dump knows nothing."""
         state = State({name: row[None] for name, row in self.physics.items()}, batch_size=[1])
+        for name in {"episode", "elapsed_steps"} & self.settings.keys():
+            state[name] = torch.tensor([self.settings[name]], dtype=torch.int32)
         for name, numbers in self.tensors.items():
             if name.startswith("model."):
                 state["model", name.removeprefix("model.")] = numbers[None]
@@ -169,6 +172,9 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     )
     if varied := [name.removeprefix("model.") for name in dump.tensors if name.startswith("model.")]:
         yield f"with numbers of its own of {', '.join(varied)}"
+    cls = _class_of(settings)
+    if remembers := bool(cls.memory or cls.shared):
+        yield "memory, and what worlds share, are not in the file: hooks see zeros, and controls may be others"
     bad = {name: ~(value.abs() < MAX_VALUE) for name, value in dump.physics.items()}
     bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
@@ -190,8 +196,12 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     for name, at in zip(("Warp", "C MuJoCo"), lost, strict=True):
         yield f"{name}: " + (f"not finite after substep {at[0]}" if len(at) else "finite to the end")
     if not wrong and not len(lost[0]):
-        gave = ", ".join(hooks_that_give_nan(dump, device)) or "a hook (control, reward, observation, memory)"
-        yield f"state, action and physics are finite: {gave} gave what is not"
+        gave, some = ", ".join(hooks_that_give_nan(dump, device)), "a hook (control, reward, observation, memory)"
+        if remembers:
+            of_zeros = gave or "none"
+            yield f"state, action and physics are finite: {some} gave what is not; with memory of zeros {of_zeros}"
+        else:
+            yield f"state, action and physics are finite: {gave or some} gave what is not"
 
 
 def hooks_that_give_nan(dump: NanDump, device: torch.device | str | None = None) -> list[str]:

@@ -26,6 +26,7 @@ from torchrl_loco.source import content_of
 from torchrl_loco.training import PPO, Given, RunFolder, Trainer, begin, evaluate_policy, preset, train
 from torchrl_loco.training.algorithm import Algorithm
 from torchrl_loco.training.config import PPOConfig
+from torchrl_loco.training.environments import Environments
 from torchrl_loco.training.start import _warn_of_what_is_not_kept
 from torchrl_loco.training.watching import last_policy
 
@@ -585,6 +586,42 @@ def test_a_script_that_is_read_for_its_class_does_not_train_again(tmp_path, monk
     with pytest.raises(RuntimeError, match="would train again: put what it does"):
         train("walker_walk", out=tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
+
+
+ORDERED = """import torchrl_loco
+class Ordered(torchrl_loco.WalkerStand):
+    def observation(self, s):
+        return {"observation": {"pos": s.qpos, "vel": s.qvel}}
+"""
+
+
+def test_terms_that_are_observed_in_another_order_are_refused(tmp_path):
+    """Their sizes may be the same: networks would learn on from the wrong numbers."""
+    file = tmp_path / "task.py"
+    file.write_text(ORDERED)
+    run = train(f"{file}:Ordered", device="cpu", out=tmp_path / "runs", **SMALL)
+    file = tmp_path / "edited" / "task.py"  # in its place it would not be imported again
+    file.parent.mkdir()
+    file.write_text(ORDERED.replace('"pos": s.qpos, "vel": s.qvel', '"vel": s.qvel, "pos": s.qpos'))
+    with pytest.raises(ValueError, match="observes vel, pos: another order"):
+        train(f"{file}:Ordered", resume=run.path, total_frames=run.load_config().total_frames + 1000)
+    for source in (run.path, run.policy):
+        with pytest.raises(ValueError, match="this run observes vel, pos: another order"):
+            train(f"{file}:Ordered", device="cpu", init=source, out=tmp_path / "other", **SMALL)
+
+
+def test_a_repeated_action_ends_with_its_episode(tmp_path):
+    config = preset(
+        "walker_walk", "cpu", num_envs=4, action_repeat=3, episode_length=10, num_steps=4, minibatch_size=16
+    )
+    env = Environments(config).training(tmp_path / "dump.safetensors")
+    td = env.reset()
+    for _ in range(8):
+        before = env.base_env.get_state()["elapsed_steps"]
+        current, td = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
+        done = current["next", "done"].flatten()
+        assert torch.equal(done, before + 3 >= 10)
+    assert env.base_env.get_state()["elapsed_steps"].max() < 10
 
 
 def test_an_option_that_is_edited_selects_the_best_policy_anew(tmp_path, capsys):

@@ -19,7 +19,7 @@ from torchrl.modules import ProbabilisticActor
 
 from torchrl_loco.encoder import PixelEncoder, shifted
 from torchrl_loco.envs import LocoEnv
-from torchrl_loco.policy import ObservationNorm, Policy, layers_of, moments
+from torchrl_loco.policy import ObservationNorm, Policy, check_terms, layers_of, moments
 from torchrl_loco.sim import TorchGraph
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Network, Spaces, layers_of_actor
@@ -383,8 +383,16 @@ def choose(rows: wp.array2d[wp.int64], order: wp.array[wp.int64], out: wp.array2
     out[i, j] = rows[order[i], j]
 
 
-def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
-    """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file."""
+def begin_from(
+    algorithm: Algorithm, source: Path, device: str, observed: Mapping[str, Mapping[str, int]] | None = None
+) -> None:
+    """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
+
+    ``observed`` are the sizes of the terms of each group of the observation, in order, which is to be theirs.
+
+    Raises:
+        ValueError: they do not fit.
+    """
     # A run without a checkpoint has a policy. A checkpoint may be named by its file.
     is_checkpoint = source.is_file() and source.suffix == ".pt"
     folder = source.parent if is_checkpoint else source
@@ -394,6 +402,7 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
         checkpoint = run.load_checkpoint(device, source if is_checkpoint else None)
+        check_order(checkpoint.get("observed", {}), observed or {}, "this run")
         networks = checkpoint["algorithm"]["networks"]
         if "network" in run.given and run.policy.is_file():  # weights do not tell what lies between them
             theirs = layers_of(Policy.load(run.policy, device).module)
@@ -413,11 +422,18 @@ def begin_from(algorithm: Algorithm, source: Path, device: str) -> None:
         algorithm.networks.load_state_dict(of_settings, strict=False)
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
+    check_order({policy.in_keys[0]: policy.info.get("terms", ())}, observed or {}, "this run")
     for mine in map(layers_of_actor, algorithm.actors):
         theirs = layers_of(policy.module)
         _check_kinds(source, mine, theirs)
         for own, other in zip(mine, theirs, strict=False):
             _copy(own, other, source, last=own is mine[-1])
+
+
+def check_order(trained: Mapping[str, Iterable[Any]], now: Mapping[str, Mapping[str, int]], task: str) -> None:
+    """Checks that each group of the observation comes in the order in which networks were trained on its terms."""
+    for group, terms in trained.items():
+        check_terms(terms, now.get(group, {}), task)
 
 
 def _check_kinds(source: Path, mine: list[nn.Module], theirs: list[nn.Module]) -> None:

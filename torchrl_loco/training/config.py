@@ -305,7 +305,8 @@ class PPOConfig(TrainingConfig):
     """Weight of the entropy bonus."""
     target_kl: float = within(NOT_NEGATIVE, 0.0)
     """KL divergence of a gradient step's policy from the one that collected (nats), beyond twice of which the learning
-    rate falls by a third, and below half of which it rises by half (Rudin et al., 2022). 0 lets it fall with time."""
+    rate falls by a third, and below half of which it rises by half (Rudin et al., 2022), within 1e-5 and 1e-2. 0 lets
+    it fall with time."""
     init_std: float = 1.0
     """Standard deviation of an action at the start; before tanh, if actions are bounded."""
 

@@ -143,9 +143,10 @@ class Environments:
             )
         if config.action_repeat == 1:
             return env
-        # The runners' tasks end at the time limit alone, and TorchRL's transform has less to do.
+        # The runners' tasks end at the time limit alone, and TorchRL's transform, which goes on there, has less to do.
         base, _ = unwrapped(env)
-        plain = is_runner(config.task) and not (base.reward_terms or base.metric_names)
+        ends_between = base.config.episode_length % config.action_repeat
+        plain = is_runner(config.task) and not (base.reward_terms or base.metric_names or ends_between)
         return TransformedEnv(env, (FrameSkipTransform if plain else ActionRepeat)(config.action_repeat))
 
     def evaluation(self, episodes: int, seed: int, info: Mapping[str, Any] | None = None) -> EnvBase:

@@ -164,6 +164,8 @@ class RunFolder:
                 "is damaged, from another release, of a task that is not installed, or of an algorithm of your own "
                 "that was not passed to training.train in this process"
             )
+            if self.policy.is_file():
+                why += f" (name {self.policy} to play, evaluate or export it)"
             raise ValueError(f"{path} {why}: {error}") from error
         return dataclasses.replace(config, **overrides)
 

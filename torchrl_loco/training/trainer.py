@@ -29,7 +29,7 @@ from torchrl_loco.sim.simulation import check_memory
 from torchrl_loco.source import content_of, source_of
 from torchrl_loco.training import distributed
 from torchrl_loco.training.actor import Spaces, deterministic_policy
-from torchrl_loco.training.algorithm import Algorithm, begin_from, settings_for_small_networks
+from torchrl_loco.training.algorithm import Algorithm, begin_from, check_order, settings_for_small_networks
 from torchrl_loco.training.config import check_packages_of
 from torchrl_loco.training.environments import Environments, Given, unwrapped
 from torchrl_loco.training.episodes import Episodes
@@ -159,7 +159,7 @@ class Trainer:
         if not first:  # the networks began alike, from here on each rank draws actions of its own
             torch.manual_seed(distributed.own_seed(config.seed))
         if checkpoint is None and config.init:
-            begin_from(self.algorithm, Path(config.init), config.device)
+            self._begin_from_init()
         if checkpoint is not None:
             self._load(checkpoint, changes.get("total_frames", math.inf))
         if first:  # nothing is refused any more
@@ -178,10 +178,13 @@ class Trainer:
         """Returns how far a curriculum has come, and what transforms have learned."""
         return {"stage": self._base.get_stage(), "transforms": state_of_transforms(self.env)}
 
+    def _begin_from_init(self) -> None:
+        begin_from(self.algorithm, Path(self.config.init), self.config.device, self._base.observation_layout)
+
     def _begin_trial(self) -> None:
         self.algorithm.begin_anew()
         if self.config.init:
-            begin_from(self.algorithm, Path(self.config.init), self.config.device)
+            self._begin_from_init()
         distributed.copy_from_first(self.algorithm.networks.state_dict().values())
         self._set_progress(self._progress_at_start)
 
@@ -511,6 +514,7 @@ class Trainer:
                 "transforms_of_best": self._transforms_of_best,
                 "stage": self._base.get_stage(),
                 "terms": list(self._terms),
+                "observed": {group: list(sizes.items()) for group, sizes in self._base.observation_layout.items()},
                 **self.environments.own,
             }
             self.run.save_checkpoint({**counters, **of, **ranks[0], "further_ranks": ranks[1:]}, self.config.keep)
@@ -556,6 +560,7 @@ class Trainer:
                 f"{self.run.path} is a run of {len(old)} case(s), {of[0]}, and not of {len(cases)}, {of[1]}: train "
                 "anew, with its weights by --init"
             )
+        check_order(checkpoint.get("observed", {}), self._base.observation_layout, self.run.task)
         options = _numbers_of(self.config.options)
         was_edited |= checkpoint.get("options", options) != options
         if was_edited and distributed.is_first():
