@@ -611,17 +611,23 @@ def test_terms_that_are_observed_in_another_order_are_refused(tmp_path):
 
 
 def test_a_repeated_action_ends_with_its_episode(tmp_path):
-    config = preset(
-        "walker_walk", "cpu", num_envs=4, action_repeat=3, episode_length=10, num_steps=4, minibatch_size=16
-    )
-    env = Environments(config).training(tmp_path / "dump.safetensors")
-    td = env.reset()
-    for _ in range(8):
-        before = env.base_env.get_state()["elapsed_steps"]
-        current, td = env.step_and_maybe_reset(td.set("action", env.action_spec.zero()))
-        done = current["next", "done"].flatten()
-        assert torch.equal(done, before + 3 >= 10)
-    assert env.base_env.get_state()["elapsed_steps"].max() < 10
+    """Beside worlds in which each step is an action of its own: what they earn, and see last."""
+    settings = {"num_envs": 8, "episode_length": 10, "num_steps": 4, "minibatch_size": 32}
+    configs = [preset("walker_walk", "cpu", action_repeat=repeat, **settings) for repeat in (3, 1)]
+    env, single = (Environments(config).training(tmp_path / "dump.safetensors") for config in configs)
+    td, each, over = env.reset(), single.reset(), torch.zeros(8, 1, dtype=torch.bool)
+    for _ in range(4):
+        action = env.action_spec.rand()
+        after, runs, earned = env.step(td.set("action", action))["next"], ~over, torch.zeros(8, 1)
+        for _ in range(3):
+            alone = single.step(each.set("action", action))["next"]
+            earned += torch.where(over, 0.0, alone["reward"])
+            over |= (ends := ~over & alone["done"])
+            assert torch.equal(after["observation"][ends[:, 0]], alone["observation"][ends[:, 0]])
+            each = alone.exclude("reward")
+        assert torch.allclose(after["reward"][runs], earned[runs])
+        td = after.exclude("reward")
+    assert over.all()
 
 
 def test_an_option_that_is_edited_selects_the_best_policy_anew(tmp_path, capsys):
