@@ -244,7 +244,7 @@ def test_memory_is_not_in_the_file_which_is_said(file, actions):
     said = list(nan_dump.describe(nan_dump.load(file)))
     assert said[1].startswith("memory, and what worlds share, are not in the file: hooks see zeros")
     assert said[-1].endswith(
-        "a hook (control, reward, observation, memory) gave what is not; with memory of zeros none"
+        "a hook (control, reward, observation, memory) gave what is not; with zeros as memory: none"
     )
 
 

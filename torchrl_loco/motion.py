@@ -51,7 +51,9 @@ class Motion:
         weight: how often it is practised, by the time it takes, relative to others.
 
     Attributes:
+        name: the file's, without its suffix.
         fps: frames per second.
+        qpos: the poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -90,15 +92,12 @@ class Motion:
 
     @property
     def name(self) -> str:
-        """The file's, without its suffix."""
+        """Name of the file, without its suffix."""
         return self.path.stem
 
     @property
     def qpos(self) -> np.ndarray:
-        """The poses as MuJoCo has them, float64 ``(frames, 7 + joints)``: the quaternion is w, x, y, z.
-
-        They cannot be written, since a training reads the file again: :func:`torchrl_loco.motion.save` writes others.
-        """
+        """The poses, read-only: a training reads the file again. :func:`torchrl_loco.motion.save` writes a new one."""
         poses = self._qpos.view()
         poses.setflags(write=False)
         return poses
@@ -150,7 +149,7 @@ class Motion:
                 f"{f'rows of {table.shape[1]}' if lines else 'none'}"
             )
         if np.array_equal(table[0], np.arange(table.shape[1])):
-            raise ValueError(f"{self.path} has the numbers of its columns in line {numbered[0][0]}: leave them out")
+            raise ValueError(f"{self.path} has the numbers of its columns in line {numbered[0][0]}: remove that line")
         return table[:, [0, 1, 2, 6, 3, 4, 5, *range(7, table.shape[1])]]
 
     def _from_npz(self, fps: float | None) -> tuple[float, np.ndarray]:

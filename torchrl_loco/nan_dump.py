@@ -53,7 +53,7 @@ class NanDump:
 
     @property
     def state(self) -> State:
-        """The state before the step, of one world; of memory, and what worlds share, a dump knows nothing."""
+        """The state before the step, of one world, without memory and what worlds share, which a dump does not hold."""
         state = State({name: row[None] for name, row in self.physics.items()}, batch_size=[1])
         for name in {"episode", "elapsed_steps"} & self.settings.keys():
             state[name] = torch.tensor([self.settings[name]], dtype=torch.int32)
@@ -174,7 +174,7 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
         yield f"with numbers of its own of {', '.join(varied)}"
     cls = _class_of(settings)
     if remembers := bool(cls.memory or cls.shared):
-        yield "memory, and what worlds share, are not in the file: hooks see zeros, and controls may be others"
+        yield "memory, and what worlds share, are not in the file: hooks see zeros, and controls may differ"
     bad = {name: ~(value.abs() < MAX_VALUE) for name, value in dump.physics.items()}
     bad["action"] = ~dump.tensors["action"].isfinite()  # finite ones are clipped
     wrong = [name for name in bad if bad[name].any()]
@@ -196,12 +196,10 @@ def describe(dump: NanDump, device: torch.device | str | None = None) -> Iterato
     for name, at in zip(("Warp", "C MuJoCo"), lost, strict=True):
         yield f"{name}: " + (f"not finite after substep {at[0]}" if len(at) else "finite to the end")
     if not wrong and not len(lost[0]):
-        gave, some = ", ".join(hooks_that_give_nan(dump, device)), "a hook (control, reward, observation, memory)"
-        if remembers:
-            of_zeros = gave or "none"
-            yield f"state, action and physics are finite: {some} gave what is not; with memory of zeros {of_zeros}"
-        else:
-            yield f"state, action and physics are finite: {gave or some} gave what is not"
+        named, a_hook = ", ".join(hooks_that_give_nan(dump, device)), "a hook (control, reward, observation, memory)"
+        gave = a_hook if remembers or not named else named
+        also = f"; with zeros as memory: {named or 'none'}" if remembers else ""
+        yield f"state, action and physics are finite: {gave} gave what is not{also}"
 
 
 def hooks_that_give_nan(dump: NanDump, device: torch.device | str | None = None) -> list[str]:

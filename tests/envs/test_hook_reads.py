@@ -246,7 +246,7 @@ def test_forces_of_actuators_are_mujocos():
     off = Driven.model.replace(
         '<option timestep="0.01"/>', '<option timestep="0.01"><flag actuation="disable"/></option>'
     )
-    with pytest.raises(ValueError, match="actuators that work"):
+    with pytest.raises(ValueError, match="needs actuators that work"):
         type("Off", (Driven,), {"model": off})(1, "cpu", engine="mujoco")
     lifts = type("Lift", (QuadrupedWalk,), {"reward": lambda self, s: s.actuator_force.sum(-1)})
     with pytest.raises(ValueError, match="motors and servos at hinges and slides"):

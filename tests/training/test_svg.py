@@ -268,7 +268,7 @@ def test_a_policy_begins_all_actors(svg, tmp_path):
         for mine in (svg._mean, svg._average, svg._shown):
             for own in mine.parameters():
                 own.normal_()
-    begin_from(svg, tmp_path / "policy.safetensors", "cpu")
+    begin_from(svg, tmp_path / "policy.safetensors", "cpu", {})
     for mine in (svg._mean, svg._average, svg._shown):
         for own, kept in zip(mine.parameters(), average, strict=True):
             torch.testing.assert_close(own.detach(), kept)

@@ -133,7 +133,7 @@ def _of_task(task: str) -> Mapping[str, tuple[Any, Any, str]]:
     cls = resolve(task)
     from torchrl_loco.envs.task import options_of_class  # with torch, as the class is
 
-    own = cls.checked_options(options_of_class(cls))
+    own = options_of_class(cls)
     return {name: (value, _of_kind(value, own.get(name, value)), words) for name, (value, words) in cls.options.items()}
 
 

@@ -49,7 +49,7 @@ def _check(m: mujoco.MjModel) -> None:
         & np.isin(m.actuator_biastype, (mujoco.mjtBias.mjBIAS_NONE, AFFINE))
     )
     if m.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ACTUATION):
-        raise ValueError("s.actuator_force is of actuators that work: the model has <flag actuation='disable'/>")
+        raise ValueError("s.actuator_force needs actuators that work: the model has <flag actuation='disable'/>")
     if not plain.all():
         names = ", ".join(m.actuator(int(i)).name or str(i) for i in np.flatnonzero(~plain)[:3])
         raise ValueError(

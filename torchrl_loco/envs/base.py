@@ -159,7 +159,7 @@ class LocoEnv(WorldAccess, QuickResets):
         device = check_device(device)
         seed = None if seed is None else check_int("seed", seed, SEED)
         given = {name: config.pop(name) for name in self.options if name in config}
-        options_given = self.checked_options({**options_of_class(type(self)), **given})
+        options_given = options_of_class(type(self), given)
         own = {name: options_given.get(name, default) for name, (default, _) in self.options.items()}
         own |= {name: tuple(own[name]) for name, (default, _) in self.options.items() if isinstance(default, tuple)}
         arguments = [*list(inspect.signature(LocoEnv.__init__).parameters)[1:-1], *own]

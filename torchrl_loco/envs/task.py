@@ -388,11 +388,11 @@ NUMBERS: dict[type, Callable[[str, Any], Any]] = {
     int: functools.partial(check_int, interval=ANY),
     float: functools.partial(check_float, interval=EXTENDED),
 }
-"""What looks at a value of an option, by the type of its default; text is looked at by its task."""
+"""Checks of the values of an option, by the type of its default; the task itself checks text."""
 
 
-def options_of_class(cls: type[Task]) -> dict[str, Any]:
-    """Returns what classes below the one that declares an option set it to: as an attribute, or as another default."""
+def options_of_class(cls: type[Task], given: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Returns, checked, what classes below the one that declares an option set it to, with what is given on top."""
     found = {}
     for name in cls.options:
         *_, declares = (base for base in cls.__mro__ if name in vars(base).get("options", {}))
@@ -401,10 +401,10 @@ def options_of_class(cls: type[Task]) -> dict[str, Any]:
             again = vars(base).get("options", {}).get(name, last)
             if name in vars(base):
                 found[name] = vars(base)[name]
-            elif again is not last:
+            elif again is not last:  # another default
                 found[name] = again[0]
             last = again
-    return found
+    return cls.checked_options({**found, **(given or {})})
 
 
 def own_hooks(cls: type) -> frozenset[str]:

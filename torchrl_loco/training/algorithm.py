@@ -383,12 +383,10 @@ def choose(rows: wp.array2d[wp.int64], order: wp.array[wp.int64], out: wp.array2
     out[i, j] = rows[order[i], j]
 
 
-def begin_from(
-    algorithm: Algorithm, source: Path, device: str, observed: Mapping[str, Mapping[str, int]] | None = None
-) -> None:
+def begin_from(algorithm: Algorithm, source: Path, device: str, observed: Mapping[str, Mapping[str, int]]) -> None:
     """Gives networks the weights of a run's checkpoint, actor and critic, or the actor those of a policy file.
 
-    ``observed`` are the sizes of the terms of each group of the observation, in order, which is to be theirs.
+    ``observed`` has by group of the observation the sizes of its terms by name, in the order in which they come.
 
     Raises:
         ValueError: they do not fit.
@@ -402,7 +400,7 @@ def begin_from(
         if all(each.from_pixels for each in settings):
             _check_strides(source, *(each.strides for each in settings))
         checkpoint = run.load_checkpoint(device, source if is_checkpoint else None)
-        check_order(checkpoint.get("observed", {}), observed or {}, "this run")
+        check_order(checkpoint.get("observed", {}), observed, "this run")
         networks = checkpoint["algorithm"]["networks"]
         if "network" in run.given and run.policy.is_file():  # weights do not tell what lies between them
             theirs = layers_of(Policy.load(run.policy, device).module)
@@ -422,7 +420,7 @@ def begin_from(
         algorithm.networks.load_state_dict(of_settings, strict=False)
         return
     policy = RunFolder(source).load_policy(device) if source.is_dir() else Policy.load(source, device)
-    check_order({policy.in_keys[0]: policy.info.get("terms", ())}, observed or {}, "this run")
+    check_order({policy.in_keys[0]: policy.info.get("terms", ())}, observed, "this run")
     for mine in map(layers_of_actor, algorithm.actors):
         theirs = layers_of(policy.module)
         _check_kinds(source, mine, theirs)

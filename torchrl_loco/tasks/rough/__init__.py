@@ -173,7 +173,8 @@ class Rough(Velocity):
         """Returns the patches by kind and difficulty, the hardest first."""
         kinds, rows = dict.fromkeys(self.ground.kinds), self.ground.difficulties[::-1]
         digits = max(2, math.ceil(math.log10(len(rows))))
-        length = type(self).episode_length or self.config.episode_length  # whatever one is given: they tell what it is
+        # The class's: a run with another length has the same cases.
+        length = type(self).episode_length or self.config.episode_length
         return {f"{kind} at {row:.{digits}f}": length for row in rows for kind in kinds}
 
     # What hooks share.

@@ -281,8 +281,7 @@ class Tracking(Robot):
     def facts(cls, m: mujoco.MjModel, info: Mapping[str, Any]) -> dict[str, Any]:
         """Returns how actions become targets of the joints, which bodies are followed about which, and frames ahead."""
         tracking: dict[str, Any] = {"base": cls.base, "anchor": cls.anchor, "bodies": list(cls.bodies)}
-        options = cls.checked_options({**options_of_class(cls), **info.get("options", {})})
-        tracking["future"] = options.get("future", [])
+        tracking["future"] = options_of_class(cls, info.get("options")).get("future", [])
         return {**super().facts(m, info), "tracking": tracking}
 
     # The hooks, in the order in which they are called.
